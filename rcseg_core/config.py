@@ -1,0 +1,353 @@
+"""Every parameter of the algorithm: one frozen group a stage, one line a parameter.
+
+This file is the only place that holds a default, a unit, a bound or a paper symbol. YAML files, ROS parameters,
+``--set group.name=value`` and the reference in ``rcseg config`` are all derived from it by `describe`.
+Where the default departs from the paper, the literal form is one of the choices (`SegmenterConfig.literal`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+from dataclasses import dataclass, field, fields
+from typing import Any, Literal, Mapping
+
+from rcseg_core.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One parameter as users see it: dotted key, value, default, type, unit, bounds or choices, symbol, text."""
+
+    key: str
+    value: Any
+    default: Any
+    type: type
+    unit: str
+    low: float | None
+    high: float | None
+    choices: tuple[str, ...]
+    symbol: str
+    doc: str
+
+
+def _param(
+    default: Any,
+    doc: str,
+    *,
+    unit: str = "",
+    low: float | None = None,
+    high: float | None = None,
+    choices: tuple[str, ...] = (),
+    symbol: str = "",
+) -> Any:
+    meta = {"doc": doc, "unit": unit, "low": low, "high": high, "choices": choices, "symbol": symbol}
+    return field(default=default, metadata=meta)
+
+
+@dataclass(frozen=True)
+class SignalConfig:
+    """Which range signal is modelled (section 2)."""
+
+    kind: Literal["auto", "inverse_depth", "xyz"] = _param(
+        "auto",
+        "auto: inverse depth where a camera model is known, else x, y, z (the paper)",
+        choices=("auto", "inverse_depth", "xyz"),
+        symbol="eta_r",
+    )
+
+
+@dataclass(frozen=True)
+class NoiseConfig:
+    """Sigma_r and Sigma_c of eq. (3)."""
+
+    range_model: Literal["auto", "constant", "kinect_v1", "realsense_d435"] = _param(
+        "auto",
+        "auto: estimated from each frame as a function of depth; constant: range_sigma at every depth; else a sensor",
+        choices=("auto", "constant", "kinect_v1", "realsense_d435"),
+        symbol="Sigma_r",
+    )
+    range_sigma: float = _param(
+        0.002, "standard deviation along depth, for range_model constant", unit="m", low=1e-7, high=1.0
+    )
+    color_sigma: float = _param(
+        0.0,
+        "standard deviation of each colour channel; 0: estimated from each frame",
+        unit="levels",
+        low=0.0,
+        high=64.0,
+        symbol="Sigma_c",
+    )
+
+
+@dataclass(frozen=True)
+class ReflectanceConfig:
+    """Colour normalisation (section 3, eq. 4-7)."""
+
+    mode: Literal["none", "active", "calibrated"] = _param(
+        "none",
+        "none: passive light; active: light at the sensor, eq. (5); calibrated: white-reference frame, eq. (6)-(7)",
+        choices=("none", "active", "calibrated"),
+        symbol="rho_lambda",
+    )
+    min_cosine: float = _param(
+        0.2, "the correction is held below this cosine of incidence, where it only amplifies noise",
+        low=0.01, high=1.0, symbol="mu.n",
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class EdgesConfig:
+    """Morphological depth, orientation and colour discontinuities (section 8; Boulanger, Blais & Cohen 1990)."""
+
+    depth_threshold: float = _param(
+        6.0, "step of the range signal that is a depth discontinuity, beside depth_step", unit="sigma",
+        low=1.0, high=1000.0,
+    )  # fmt: skip
+    depth_step: float = _param(
+        0.02, "least step that is a depth discontinuity", unit="fraction of depth", low=0.0, high=1.0
+    )
+    orientation_threshold: float = _param(
+        5.0, "morphological Laplacian that is an orientation discontinuity", unit="sigma", low=1.0, high=1000.0
+    )
+    orientation_window: int = _param(
+        7, "odd window of the morphological Laplacian", unit="px", low=3, high=15
+    )
+    color_threshold: float = _param(
+        40.0, "morphological gradient of one channel that is a colour edge", unit="levels", low=1.0, high=255.0
+    )
+    outlier_threshold: float = _param(
+        6.0, "distance from the local median beyond which a pixel is an impulse, not an edge; 0: none are flagged",
+        unit="sigma", low=0.0, high=1000.0,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class SeedsConfig:
+    """Initial partition by windows with least median of squares (section 5)."""
+
+    max_window: int = _param(11, "largest window, odd", unit="px", low=3, high=31, symbol="L_max")
+    min_window: int = _param(3, "smallest window, odd", unit="px", low=3, high=31, symbol="L_min")
+    fit: Literal["auto", "lms"] = _param(
+        "auto",
+        "lms: every window (the paper); auto: only windows whose least-squares residual is not pure noise",
+        choices=("auto", "lms"),
+    )
+    subsets: int = _param(72, "random minimal subsets a window; 72 give 99 % at 50 % outliers", low=1, high=2000)
+    min_valid: float = _param(
+        0.5, "least share of usable pixels in a window", unit="fraction", low=0.1, high=1.0
+    )
+
+
+@dataclass(frozen=True)
+class GroupingConfig:
+    """Best-first grouping of adjacent regions (section 6, eq. 16-21)."""
+
+    criterion: Literal["bounded", "chow", "bayes"] = _param(
+        "bounded",
+        "bounded: the joint model must explain both sides; chow: total rise of the residual; bayes: c_ib of eq. (21)",
+        choices=("bounded", "chow", "bayes"),
+        symbol="c_ib",
+    )
+    range_tolerance: float = _param(
+        0.004, "approximation limit of the range models", unit="fraction of depth (of extent for scanner grids)",
+        low=0.0, high=0.5, symbol="epsilon_t (range)",
+    )  # fmt: skip
+    color_tolerance: float = _param(
+        20.0, "approximation limit of the colour models", unit="levels", low=0.0, high=255.0,
+        symbol="epsilon_t (colour)",
+    )  # fmt: skip
+    noise_share: float = _param(
+        0.6, "systematic part of the noise that more pixels do not average away", unit="sigma", low=0.0, high=10.0
+    )
+    edge_gate: bool = _param(
+        True, "scale the tolerance by the share of the common boundary that crosses no detected edge"
+    )
+    max_gap: int = _param(3, "regions at most this far apart are adjacent", unit="px", low=1, high=15)
+    prior_beta: float = _param(
+        1.0, "strength of the belief in the coefficients, for criterion bayes", unit="sigma", low=1e-6, high=1e6,
+        symbol="beta",
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class GeneralizationConfig:
+    """Degrees that grow only when the statistics demand it (section 7, eq. 22-23)."""
+
+    hypothesis: Literal["pair", "region"] = _param(
+        "pair",
+        "pair: a higher degree is tried on the union of two regions; region: on each region alone (the paper)",
+        choices=("pair", "region"),
+    )
+    test: Literal["guarded", "f"] = _param(
+        "guarded",
+        "guarded: nested F test and an effect of at least min_effect; f: the F test alone (the paper)",
+        choices=("guarded", "f"),
+    )
+    alpha: float = _param(0.1, "level of the F test", unit="probability", low=1e-6, high=0.5, symbol="alpha")
+    min_effect: float = _param(
+        0.25, "least fall of the rms residual that justifies a degree", unit="sigma", low=0.0, high=10.0
+    )
+    max_range_degree: int = _param(4, "highest degree of the range patches", low=1, high=4, symbol="k")
+    max_color_degree: int = _param(2, "highest degree of the colour patches", low=1, high=4, symbol="k")
+
+
+@dataclass(frozen=True)
+class AbsorptionConfig:
+    """Single pixels join the region that predicts them (section 2, step 3: 'or points')."""
+
+    enabled: bool = _param(True, "absorb unassigned pixels into adjacent regions")
+    max_cost: float = _param(
+        16.0, "largest squared residual of an absorbed pixel", unit="sigma^2 (noise and half the tolerance)",
+        low=0.0, high=1e6,
+    )  # fmt: skip
+    min_region: int = _param(
+        30, "smaller leftovers join a neighbour instead of becoming a region", unit="px at 640x480", low=1,
+        high=10000,
+    )  # fmt: skip
+    refine_passes: int = _param(
+        2, "passes in which boundary pixels move to the neighbour that predicts them better", low=0, high=20
+    )
+
+
+@dataclass(frozen=True)
+class SegmenterConfig:
+    """The whole configuration. Frozen; build variants with `replace`, `from_dict` or `dataclasses.replace`."""
+
+    signal: SignalConfig = SignalConfig()
+    noise: NoiseConfig = NoiseConfig()
+    reflectance: ReflectanceConfig = ReflectanceConfig()
+    edges: EdgesConfig = EdgesConfig()
+    seeds: SeedsConfig = SeedsConfig()
+    grouping: GroupingConfig = GroupingConfig()
+    generalization: GeneralizationConfig = GeneralizationConfig()
+    absorption: AbsorptionConfig = AbsorptionConfig()
+
+    def __post_init__(self) -> None:
+        for parameter in describe(self):
+            _check(parameter)
+        if self.seeds.min_window > self.seeds.max_window:
+            raise ConfigError(
+                f"seeds.min_window = {self.seeds.min_window} is larger than "
+                f"seeds.max_window = {self.seeds.max_window}"
+            )
+
+    @classmethod
+    def from_dict(cls, nested: Mapping[str, Any]) -> SegmenterConfig:
+        """Defaults overridden by a nested mapping {group: {name: value}}; unknown keys are errors.
+
+        Raises
+        ------
+        ConfigError
+            Naming the key, the value and what is allowed.
+        """
+        flat: dict[str, Any] = {}
+        if not isinstance(nested, Mapping):
+            raise ConfigError(f"a configuration is a mapping of groups, got {type(nested).__name__}")
+        for group, values in nested.items():
+            if not isinstance(values, Mapping):
+                raise ConfigError(f"{group}: expected a mapping of parameters, got {values!r}")
+            for name, value in values.items():
+                flat[f"{group}.{name}"] = value
+        return cls().replace(flat)
+
+    def replace(self, changes: Mapping[str, Any]) -> SegmenterConfig:
+        """A copy with some dotted keys changed, for example ``{"grouping.range_tolerance": 0.004}``.
+
+        Strings are converted to the parameter's type, so that ``--set`` values can be passed as they come.
+
+        Raises
+        ------
+        ConfigError
+            Unknown key, wrong type or value out of bounds.
+        """
+        known = {p.key: p for p in describe(self)}
+        groups: dict[str, dict[str, Any]] = {}
+        for key, value in changes.items():
+            if key not in known:
+                near = difflib.get_close_matches(key, known, n=1)
+                hint = f"; did you mean {near[0]}?" if near else "; `rcseg config` lists all parameters"
+                raise ConfigError(f"unknown parameter {key}{hint}")
+            group, name = key.split(".")
+            groups.setdefault(group, {})[name] = _convert(known[key], value)
+        return dataclasses.replace(
+            self, **{g: dataclasses.replace(getattr(self, g), **values) for g, values in groups.items()}
+        )
+
+    def to_dict(self) -> dict[str, dict[str, Any]]:
+        """Nested plain values, the inverse of `from_dict`."""
+        return dataclasses.asdict(self)
+
+    @classmethod
+    def literal(cls) -> SegmenterConfig:
+        """The paper's own choices wherever the default departs from them."""
+        return cls().replace(
+            {
+                "signal.kind": "xyz",
+                "seeds.fit": "lms",
+                "grouping.criterion": "bayes",
+                "grouping.edge_gate": False,
+                "generalization.hypothesis": "region",
+                "generalization.test": "f",
+            }
+        )
+
+
+def describe(config: SegmenterConfig) -> list[Parameter]:
+    """Every parameter of `config` in file order, with its default, type, unit, bounds, symbol and text."""
+    out = []
+    for group in fields(SegmenterConfig):
+        values = getattr(config, group.name)
+        for f in fields(type(group.default)):
+            out.append(
+                Parameter(
+                    key=f"{group.name}.{f.name}",
+                    value=getattr(values, f.name),
+                    default=f.default,
+                    type=type(f.default),
+                    **f.metadata,
+                )
+            )
+    return out
+
+
+def _convert(parameter: Parameter, value: Any) -> Any:
+    """`value` as the parameter's type; text is parsed, integers may stand for floats, booleans for nothing else."""
+    kind = parameter.type
+    if isinstance(value, str) and kind is bool:
+        words = {"true": True, "yes": True, "on": True, "1": True, "false": False, "no": False, "off": False, "0": False}
+        if value.lower() in words:
+            return words[value.lower()]
+    elif isinstance(value, str) and kind in (int, float):
+        try:
+            return kind(value)
+        except ValueError:
+            pass
+    elif kind is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    elif type(value) is kind:
+        return value
+    raise ConfigError(f"{parameter.key} = {value!r}: expected {_expected(parameter)}")
+
+
+def _expected(parameter: Parameter) -> str:
+    if parameter.choices:
+        return "one of " + ", ".join(parameter.choices)
+    if parameter.type is bool:
+        return "true or false"
+    unit = f" {parameter.unit}" if parameter.unit else ""
+    odd = "an odd " if parameter.key.endswith("_window") else "a "
+    kind = "whole number" if parameter.type is int else "number"
+    return f"{odd}{kind} from {parameter.low} to {parameter.high}{unit}"
+
+
+def _check(parameter: Parameter) -> None:
+    value = parameter.value
+    bad = type(value) is not parameter.type
+    if not bad and parameter.choices:
+        bad = value not in parameter.choices
+    elif not bad and parameter.type in (int, float):
+        bad = not (parameter.low <= value <= parameter.high)  # type: ignore[operator]  # NaN fails too
+        bad = bad or (parameter.key.endswith("_window") and value % 2 == 0)
+    if bad:
+        raise ConfigError(f"{parameter.key} = {value!r}: expected {_expected(parameter)}")

@@ -1,0 +1,138 @@
+"""The input at the door: one registered pair of a range image and a colour image (section 2), and its camera.
+
+Everything is checked here, once; the rooms further in trust it. The range signal of a camera is inverse depth,
+because a plane seen through a pinhole is exactly linear in the pixel coordinates there (and nowhere else).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rcseg_core.errors import InputError
+
+
+@dataclass(frozen=True)
+class PinholeCamera:
+    """A pinhole camera in pixels: ``col = fx x/z + cx``, ``row = fy y/z + cy`` (optical frame).
+
+    Raises
+    ------
+    InputError
+        If a focal length is not positive or a value is not finite.
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+    def __post_init__(self) -> None:
+        if not all(math.isfinite(v) for v in (self.fx, self.fy, self.cx, self.cy)):
+            raise InputError(f"camera: intrinsics must be finite, got {self}")
+        if self.fx <= 0 or self.fy <= 0:
+            raise InputError(f"camera: fx and fy must be positive pixels, got fx={self.fx}, fy={self.fy}")
+
+    def rays(self, height: int, width: int) -> NDArray[np.float32]:
+        """(height, width, 3) float32 rays with z = 1; a point is ``ray * depth`` or ``ray / inverse depth``."""
+        rays = np.ones((height, width, 3), np.float32)
+        rays[..., 0] = ((np.arange(width) - self.cx) / self.fx)[None, :]
+        rays[..., 1] = ((np.arange(height) - self.cy) / self.fy)[:, None]
+        return rays
+
+    def matrix(self) -> NDArray[np.float64]:
+        """(3, 3) camera matrix K."""
+        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], float)
+
+
+@dataclass(frozen=True)
+class RangeColorFrame:
+    """A registered range and colour image.
+
+    Parameters
+    ----------
+    points : (H, W, 3) float32 or float64, metres, optical frame
+        NaN, infinite or z = 0 marks an invalid pixel.
+    color : (H, W, 3) uint8, RGB
+    camera : PinholeCamera or None
+        None for scanner grids: the range signal is then x, y, z.
+
+    Raises
+    ------
+    InputError
+        Wrong shape or dtype, images of different size, smaller than 3x3, or no valid pixel.
+    """
+
+    points: NDArray[Any]
+    color: NDArray[np.uint8]
+    camera: PinholeCamera | None = None
+
+    def __post_init__(self) -> None:
+        points, color = self.points, self.color
+        if not isinstance(points, np.ndarray) or points.ndim != 3 or points.shape[2] != 3:
+            raise InputError(f"points: expected an array of shape (H, W, 3), got {_what(points)}")
+        if points.dtype not in (np.float32, np.float64):
+            raise InputError(f"points: expected float32 or float64 metres, got {points.dtype}")
+        if not isinstance(color, np.ndarray) or color.ndim != 3 or color.shape[2] != 3:
+            raise InputError(f"color: expected an array of shape (H, W, 3), got {_what(color)}")
+        if color.dtype != np.uint8:
+            raise InputError(f"color: expected uint8 RGB, got {color.dtype}")
+        if points.shape != color.shape:
+            raise InputError(
+                f"points are {points.shape[1]}x{points.shape[0]} and color is {color.shape[1]}x{color.shape[0]}: "
+                "both must be registered in one pixel grid"
+            )
+        if min(points.shape[:2]) < 3:
+            raise InputError(f"the image is {points.shape[1]}x{points.shape[0]}: at least 3x3 pixels are needed")
+        if self.camera is not None and not isinstance(self.camera, PinholeCamera):
+            raise InputError(f"camera: expected a PinholeCamera or None, got {type(self.camera).__name__}")
+        if not self.valid.any():
+            raise InputError("no valid pixel: every point is NaN or has z = 0")
+
+    @classmethod
+    def from_depth(
+        cls, depth_m: NDArray[Any], color: NDArray[np.uint8], camera: PinholeCamera
+    ) -> RangeColorFrame:
+        """A frame from a depth image along the optical axis.
+
+        Parameters
+        ----------
+        depth_m : (H, W) float32 or float64, metres; 0, NaN or negative marks an invalid pixel.
+        """
+        if not isinstance(depth_m, np.ndarray) or depth_m.ndim != 2:
+            raise InputError(f"depth: expected an array of shape (H, W), got {_what(depth_m)}")
+        if depth_m.dtype not in (np.float32, np.float64):
+            raise InputError(f"depth: expected float32 or float64 metres, got {depth_m.dtype}")
+        if not isinstance(camera, PinholeCamera):
+            raise InputError("camera: a depth image needs a PinholeCamera")
+        points = camera.rays(*depth_m.shape) * depth_m[..., None].astype(np.float32)
+        return cls(points, color, camera)
+
+    @property
+    def height(self) -> int:
+        return int(self.points.shape[0])
+
+    @property
+    def width(self) -> int:
+        return int(self.points.shape[1])
+
+    @property
+    def depth_m(self) -> NDArray[Any]:
+        """(H, W) depth along the optical axis, metres; NaN or 0 where invalid."""
+        return self.points[..., 2]
+
+    @cached_property
+    def valid(self) -> NDArray[np.bool_]:
+        """(H, W) bool: finite points; with a camera also in front of it."""
+        z = self.points[..., 2]
+        finite = np.isfinite(self.points).all(axis=2) if self.camera is None else np.isfinite(z)
+        return finite & (z > 0) if self.camera is not None else finite & (z != 0)
+
+
+def _what(value: object) -> str:
+    return f"shape {value.shape}" if isinstance(value, np.ndarray) else type(value).__name__
