@@ -64,6 +64,13 @@ def tangents(normal: Array) -> tuple[Array, Array]:
     return first, np.cross(normal, first)
 
 
+def random_rotation(rng: np.random.Generator) -> Array:
+    """A rotation matrix, uniform over all orientations (QR of a Gaussian matrix)."""
+    q, r = np.linalg.qr(rng.normal(size=(3, 3)))
+    q *= np.sign(np.diag(r))
+    return q if np.linalg.det(q) > 0 else -q
+
+
 @dataclass(frozen=True)
 class Plane:
     """A plane through `point`; paint coordinates are metres along `first` and `second`. `half_size` bounds it."""

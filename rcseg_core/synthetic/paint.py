@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
+from rcseg_core.errors import InputError
 
 Array = NDArray[np.float64]
 Mask = Callable[[Array], NDArray[np.bool_]]

@@ -1,0 +1,13 @@
+"""Analytic scenes with exact truth for tuning, tests and reports; nothing in the pipeline imports them."""
+
+from .paint import LEAST_DIFFERENCE
+from .scene import FAMILIES, SCANNER_FAMILIES, SyntheticScene, default_camera, make_scene
+
+__all__ = [
+    "FAMILIES",
+    "LEAST_DIFFERENCE",
+    "SCANNER_FAMILIES",
+    "SyntheticScene",
+    "default_camera",
+    "make_scene",
+]
