@@ -1,0 +1,57 @@
+"""Package rcseg: for pip by this file alone, for colcon (ROS package rcseg_ros) together with package.xml."""
+
+from glob import glob
+from pathlib import Path
+
+from setuptools import find_packages, setup
+
+ROS_PACKAGE = "rcseg_ros"
+
+setup(
+    name="rcseg",
+    version="0.1.0",
+    description="Segments registered range and colour images into Bezier patches",
+    long_description=Path("README.md").read_text(encoding="utf-8"),
+    long_description_content_type="text/markdown",
+    author="rcseg maintainers",
+    author_email="rcseg@example.org",
+    license="Apache-2.0",
+    python_requires=">=3.10",
+    packages=[
+        *find_packages(include=["rcseg_core", "rcseg_core.*", "rcseg_ros", "rcseg_ros.*"]),
+        "rcseg_ros.msg",
+    ],
+    # The message definitions travel with the Python package, to write result bags without built ones.
+    package_dir={"rcseg_ros.msg": "rcseg_msgs/msg"},
+    package_data={"rcseg_ros.msg": ["*.msg"], "rcseg_core": ["py.typed"]},
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{ROS_PACKAGE}"]),
+        (f"share/{ROS_PACKAGE}", ["package.xml"]),
+        (f"share/{ROS_PACKAGE}/launch", glob("launch/*.launch.py")),
+        (f"share/{ROS_PACKAGE}/config", glob("config/*.*")),
+    ],
+    install_requires=[
+        "numpy>=1.26",
+        "scipy>=1.10",
+        "numba>=0.59",
+        "opencv-python-headless>=4.6",
+        "matplotlib>=3.6",
+        "pyyaml>=6.0",
+        "typer>=0.12",
+        "rich>=13.0",
+        "rosbags>=0.11",
+        "mcap>=1.1",
+    ],
+    extras_require={
+        "test": ["pytest>=8.0", "hypothesis>=6.90", "mcap-ros2-support>=0.5", "imgviz>=2.0"],
+        "dev": ["ruff>=0.6", "mypy>=1.10", "import-linter>=2.0", "codespell>=2.2", "pre-commit>=3.5"],
+        "ros": ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"],
+    },
+    entry_points={
+        "console_scripts": [
+            "rcseg = rcseg_ros.cli:main",
+            "segmentation_node = rcseg_ros.node:main",
+        ]
+    },
+    zip_safe=False,
+)
