@@ -69,7 +69,7 @@ def cloud_message(
 ) -> Any:
     """Organised PointCloud2 with x, y, z, rgb (packed, as PCL and RViz read it) and label (uint32).
 
-    points : (H, W, 3) metres, NaN where there is none; color : (H, W, 3) uint8; labels : (H, W), 0 unlabelled.
+    points : (H, W, 3) metres, NaN where there is none; color : (H, W, 3) uint8; labels : (H, W), 0: none
     """
     height, width = labels.shape
     cloud = np.empty((height, width), _CLOUD_DTYPE)
