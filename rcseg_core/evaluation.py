@@ -1,0 +1,466 @@
+"""Figures that say how good a segmentation is: Hoover's classes, information, overlap, parts, reconstruction.
+
+All label figures come from one contingency table of truth and machine regions, so a frame costs milliseconds. Three
+conventions hold everywhere:
+
+- pixels that are invalid in the input are nobody's: they count for no region (an algorithm is not asked about them);
+- truth regions smaller than 100 px at 640 x 480 (the same share of other sizes) after that are ignored together with their
+  pixels: a sliver may be absorbed or found, neither is punished;
+- machine regions are never ignored for their size: whatever carries a label can be noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from rcseg_core.errors import InputError
+from rcseg_core.hoover import TOLERANCES, Contingency, HooverResult, contingency, sweep
+
+if TYPE_CHECKING:
+    from rcseg_core.synthetic import SyntheticScene
+
+LEAST_AREA_SHARE = 100 / (640 * 480)
+REPORT_TOLERANCE = 0.8
+
+
+class HasLabels(Protocol):
+    """What is judged: a `Segmentation`, or anything with its label images."""
+
+    @property
+    def labels(self) -> NDArray[np.int32]: ...
+    @property
+    def surface_labels(self) -> NDArray[np.int32]: ...
+
+
+@dataclass(frozen=True)
+class LabelMetrics:
+    """How well machine regions match truth regions.
+
+    Attributes
+    ----------
+    hoover : tuple of HooverResult
+        One for each tolerance of the sweep.
+    voi_bits : float
+        Variation of information H(truth | machine) + H(machine | truth), base 2; 0 is perfect. Unlabelled pixels
+        form one machine region of their own.
+    voi_split_bits, voi_merge_bits : float
+        Its two terms: H(machine | truth) grows with over-, H(truth | machine) with under-segmentation.
+    rand, adjusted_rand : float
+        Share of pixel pairs on which both agree; the same corrected for chance. Unlabelled as for `voi_bits`.
+    covering : float
+        Mean over truth pixels of the best intersection over union of their region with a machine region.
+    coverage : float
+        Share of truth pixels that carry a machine label.
+    truth_regions, machine_regions : int
+    large_noise : int
+        Noise regions at the report tolerance that are no smaller than the least truth region; `hoover` counts all.
+    """
+
+    hoover: tuple[HooverResult, ...]
+    voi_bits: float
+    voi_split_bits: float
+    voi_merge_bits: float
+    rand: float
+    adjusted_rand: float
+    covering: float
+    coverage: float
+    truth_regions: int
+    machine_regions: int
+    large_noise: int
+
+    def at(self, tolerance: float = REPORT_TOLERANCE) -> HooverResult:
+        """The classification at one tolerance of the sweep.
+
+        Raises
+        ------
+        InputError
+            When the sweep does not hold this tolerance.
+        """
+        for result in self.hoover:
+            if abs(result.tolerance - tolerance) < 1e-9:
+                return result
+        known = ", ".join(f"{r.tolerance:g}" for r in self.hoover)
+        raise InputError(f"tolerance {tolerance:g} was not evaluated; the sweep holds {known}")
+
+
+@dataclass(frozen=True)
+class PartMetrics:
+    """Figures for truth that labels whole objects, of which a machine region may be a part.
+
+    Attributes
+    ----------
+    purity : float
+        Share of labelled truth pixels that lie in the truth object which holds most of their machine region.
+    boundary_recall : float
+        Share of the pixels on a border of two truth objects that have a machine border within 2 px (Euclidean).
+        NaN when no two truth objects touch.
+    coverage : float
+        Share of truth pixels that carry a machine label.
+    parts_per_object : float
+        Mean over objects. A machine region is a part of the object that holds most of it. It counts
+        min(1, pixels / s) with s the larger of 50 px (at 640 x 480) and 1 % of the object; each unlabelled pixel of the object
+        counts 1 / s. So crumbs count by their area: neither breaking a region into crumbs nor leaving
+        pixels unlabelled ever lowers the figure. An object without any part counts as 1.
+    raw_parts_per_object : float
+        The plain number of machine regions, of any size, that lie mainly in the object.
+    best_iou : float
+        Mean over objects of the largest intersection over union with a single machine region.
+    objects : int
+    """
+
+    purity: float
+    boundary_recall: float
+    coverage: float
+    parts_per_object: float
+    raw_parts_per_object: float
+    best_iou: float
+    objects: int
+
+
+@dataclass(frozen=True)
+class ReconstructionMetrics:
+    """Error of the reconstruction against the noise-free scene, over valid pixels that were reconstructed.
+
+    Attributes
+    ----------
+    depth_error_sigmas : float
+        Median of |z - z_true| / sigma_z, sigma_z the sensor's own noise at the pixel.
+    depth_rms_sigmas : float
+        Root mean square of the same.
+    color_error_levels : float
+        Median over pixels of the largest channel's |error|, 0-255 levels.
+    completeness : float
+        Share of the valid truth pixels that were reconstructed.
+    """
+
+    depth_error_sigmas: float
+    depth_rms_sigmas: float
+    color_error_levels: float
+    completeness: float
+
+
+@dataclass(frozen=True)
+class SceneMetrics:
+    """All figures of one frame; None where its truth does not allow them."""
+
+    name: str
+    labels: LabelMetrics | None = None
+    parts: PartMetrics | None = None
+    reconstruction: ReconstructionMetrics | None = None
+
+    def row(self, tolerance: float = REPORT_TOLERANCE) -> dict[str, Any]:
+        """Flat name -> number, as tables and CSV files need it."""
+        row: dict[str, Any] = {"frame": self.name}
+        if self.labels is not None:
+            result = self.labels.at(tolerance)
+            for key in ("truth_regions", "correct", "over", "under", "missed", "noise"):
+                row[key] = getattr(result, key)
+            keys = ("large_noise", "machine_regions", "voi_bits", "rand", "adjusted_rand", "covering", "coverage")
+            row |= {key: getattr(self.labels, key) for key in keys}
+        for group in (self.parts, self.reconstruction):
+            if group is not None:
+                row |= asdict(group)
+        return row
+
+
+def least_area(shape: tuple[int, ...]) -> float:
+    """Pixels below which a truth region of an image (H, W) is ignored."""
+    return LEAST_AREA_SHARE * shape[0] * shape[1]
+
+
+def without_slivers(
+    truth: NDArray[Any], mask: NDArray[np.bool_], minimum_area: float | None = None
+) -> NDArray[np.bool_]:
+    """`mask` (H, W) without the pixels of truth regions that are too small to count."""
+    minimum_area = least_area(truth.shape) if minimum_area is None else minimum_area
+    sizes = np.bincount(truth[mask])
+    small = sizes < minimum_area
+    if len(small):
+        small[0] = False
+    return mask & ~np.append(small, np.zeros(int(truth.max()) + 1 - len(small), bool))[truth]
+
+
+def evaluate_labels(
+    truth: NDArray[Any],
+    machine: NDArray[Any],
+    *,
+    mask: NDArray[np.bool_] | None = None,
+    tolerances: Sequence[float] = TOLERANCES,
+    minimum_area: float | None = None,
+) -> LabelMetrics:
+    """Compare two label images.
+
+    Parameters
+    ----------
+    truth, machine : (H, W) integer, 0 for none
+    mask : (H, W) bool, optional
+        Pixels that are valid in the input.
+    tolerances : shares in (.5, 1]
+    minimum_area : float, pixels, optional
+        By default 100 px at 640 x 480, scaled by the area of the image.
+
+    Raises
+    ------
+    InputError
+        Shapes differ, labels are not integers, a tolerance is out of range, or no truth region is left.
+    """
+    mask = np.ones(truth.shape, bool) if mask is None else mask
+    minimum_area = least_area(truth.shape) if minimum_area is None else minimum_area
+    table = contingency(truth, machine, without_slivers(truth, mask, minimum_area))
+    if not len(table.truth_ids):
+        raise InputError(f"truth: no region of at least {minimum_area:.0f} valid pixels; there is nothing to compare with")
+    results = sweep(table, tolerances)
+    split, merge = conditional_entropies(table.counts[1:])
+    rand, adjusted = rand_indices(table.counts[1:])
+    nearest = min(results, key=lambda r: abs(r.tolerance - REPORT_TOLERANCE))
+    noise = np.array([kind == "noise" for kind in nearest.machine_class], bool)
+    return LabelMetrics(
+        hoover=results,
+        voi_bits=split + merge,
+        voi_split_bits=split,
+        voi_merge_bits=merge,
+        rand=rand,
+        adjusted_rand=adjusted,
+        covering=covering(table),
+        coverage=_coverage(table),
+        truth_regions=len(table.truth_ids),
+        machine_regions=len(table.machine_ids),
+        large_noise=int(np.count_nonzero(noise & (table.machine_sizes >= minimum_area))),
+    )
+
+
+def conditional_entropies(counts: NDArray[np.int64]) -> tuple[float, float]:
+    """H(column | row) and H(row | column) in bits of a table of counts."""
+    p = counts / counts.sum()
+    rows, cols = p.sum(axis=1, keepdims=True), p.sum(axis=0, keepdims=True)
+    some = p > 0
+    given_row = -np.sum(p[some] * np.log2((p / np.where(rows > 0, rows, 1))[some]))
+    given_col = -np.sum(p[some] * np.log2((p / np.where(cols > 0, cols, 1))[some]))
+    return max(float(given_row), 0.0), max(float(given_col), 0.0)
+
+
+def rand_indices(counts: NDArray[np.int64]) -> tuple[float, float]:
+    """Rand index and adjusted Rand index (Hubert & Arabie 1985) of a table of counts."""
+    n = float(counts.sum())
+    pairs = n * (n - 1) / 2
+    if pairs == 0:
+        return 1.0, 1.0
+    together = _pairs(counts).sum()
+    in_rows, in_cols = _pairs(counts.sum(axis=1)).sum(), _pairs(counts.sum(axis=0)).sum()
+    rand = float((pairs + 2 * together - in_rows - in_cols) / pairs)
+    expected = in_rows * in_cols / pairs
+    most = (in_rows + in_cols) / 2
+    return rand, float((together - expected) / (most - expected)) if most > expected else 1.0
+
+
+def _pairs(counts: NDArray[np.int64]) -> NDArray[np.float64]:
+    values = counts.astype(float)
+    return values * (values - 1) / 2
+
+
+def intersection_over_union(table: Contingency) -> NDArray[np.float64]:
+    """(N, M)"""
+    union = table.truth_sizes[:, None] + table.machine_sizes[None, :] - table.overlap
+    return table.overlap / np.maximum(union, 1)
+
+
+def covering(table: Contingency) -> float:
+    """Arbelaez et al. 2011: sum over truth regions of their share of the pixels times their best IoU."""
+    if not len(table.machine_ids):
+        return 0.0
+    best = intersection_over_union(table).max(axis=1)
+    return float(best @ table.truth_sizes / table.truth_sizes.sum())
+
+
+def _coverage(table: Contingency) -> float:
+    return float(1 - table.counts[1:, 0].sum() / table.counts[1:].sum())
+
+
+def evaluate_parts(
+    truth: NDArray[Any],
+    machine: NDArray[Any],
+    *,
+    mask: NDArray[np.bool_] | None = None,
+    background: Iterable[int] = (),
+    minimum_area: float | None = None,
+) -> PartMetrics:
+    """Compare machine regions with whole objects; see `PartMetrics`.
+
+    Parameters
+    ----------
+    background : labels of the truth, optional
+        Support and background: they count for purity, borders and coverage, but are no objects.
+
+    Raises
+    ------
+    InputError
+        As `evaluate_labels`, or when no object is left.
+    """
+    mask = np.ones(truth.shape, bool) if mask is None else mask
+    judged = without_slivers(truth, mask, minimum_area)
+    table = contingency(truth, machine, judged)
+    objects = ~np.isin(table.truth_ids, list(background))
+    if not objects.any():
+        raise InputError("truth: no object of sufficient size; there is nothing to compare with")
+    best = intersection_over_union(table).max(axis=1, initial=0.0)
+    raw, parts = _count_parts(table, 0.5 * least_area(truth.shape))
+    labelled = table.overlap.sum()
+    return PartMetrics(
+        purity=float(table.overlap.max(axis=0, initial=0).sum() / labelled) if labelled else 0.0,
+        boundary_recall=boundary_recall(truth, machine, mask),
+        coverage=_coverage(table),
+        parts_per_object=float(parts[objects].mean()),
+        raw_parts_per_object=float(raw[objects].mean()),
+        best_iou=float(best[objects].mean()),
+        objects=int(objects.sum()),
+    )
+
+
+def _count_parts(table: Contingency, crumb_px: float) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Raw and weighted number of parts of each truth region (N,); `PartMetrics.parts_per_object` has the rule."""
+    scale = np.maximum(crumb_px, 0.01 * table.truth_sizes)
+    unlabelled = table.counts[1:, 0] / scale
+    raw = np.zeros(len(table.truth_ids), np.int64)
+    weighted = unlabelled.astype(float)
+    for part in np.flatnonzero(table.overlap.sum(axis=0)):
+        owner = int(np.argmax(table.overlap[:, part]))
+        raw[owner] += 1
+        weighted[owner] += min(1.0, table.overlap[owner, part] / scale[owner])
+    return raw, np.maximum(weighted, 1.0)
+
+
+def boundary_recall(
+    truth: NDArray[Any], machine: NDArray[Any], mask: NDArray[np.bool_], *, within_px: float = 2.0
+) -> float:
+    """Share of truth border pixels with a machine border within `within_px`; NaN without truth borders.
+
+    A pixel is on a border when a 4-neighbour has another label. On the truth both must be labelled; on the machine's
+    side a step to unlabelled counts, but never a step to a pixel that is invalid in the input.
+    """
+    wanted = borders(truth, mask & (truth > 0))
+    if not wanted.any():
+        return float("nan")
+    drawn = borders(machine, mask)
+    if not drawn.any():
+        return 0.0
+    distance = ndimage.distance_transform_edt(~drawn)
+    return float(np.count_nonzero(distance[wanted] <= within_px) / np.count_nonzero(wanted))
+
+
+def borders(labels: NDArray[Any], mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Pixels (H, W) of `mask` with a 4-neighbour in `mask` of another label."""
+    border = np.zeros(labels.shape, bool)
+    down = (labels[1:] != labels[:-1]) & mask[1:] & mask[:-1]
+    right = (labels[:, 1:] != labels[:, :-1]) & mask[:, 1:] & mask[:, :-1]
+    border[1:] |= down
+    border[:-1] |= down
+    border[:, 1:] |= right
+    border[:, :-1] |= right
+    return border
+
+
+def evaluate_reconstruction(
+    points: NDArray[Any], color: NDArray[np.uint8], scene: SyntheticScene
+) -> ReconstructionMetrics:
+    """Compare a reconstruction, (H, W, 3) metres and levels, with the scene's clean data."""
+    wanted = scene.frame.valid & (scene.labels > 0)
+    made = wanted & np.isfinite(points).all(axis=2) & (points[..., 2] != 0)
+    if not made.any():
+        return ReconstructionMetrics(float("nan"), float("nan"), float("nan"), 0.0)
+    error = np.abs(points[made, 2] - scene.clean_points[made, 2]) / scene.sigma_range[made]
+    levels = np.abs(color[made].astype(float) - scene.clean_color[made]).max(axis=1)
+    return ReconstructionMetrics(
+        depth_error_sigmas=float(np.median(error)),
+        depth_rms_sigmas=float(np.sqrt(np.mean(error**2))),
+        color_error_levels=float(np.median(levels)),
+        completeness=float(made.sum() / wanted.sum()),
+    )
+
+
+def evaluate_scene(
+    scene: SyntheticScene,
+    result: HasLabels,
+    *,
+    level: str = "regions",
+    tolerances: Sequence[float] = TOLERANCES,
+    minimum_area: float | None = None,
+) -> SceneMetrics:
+    """All figures of one synthetic scene.
+
+    Parameters
+    ----------
+    result : Segmentation
+        Its `reconstruct()` is judged too where it has one.
+    level : "regions" or "surfaces"
+        Compare `labels` with surface x albedo, or `surface_labels` with surfaces.
+
+    Raises
+    ------
+    InputError
+        Unknown level, or as `evaluate_labels`.
+    """
+    if level not in ("regions", "surfaces"):
+        raise InputError(f"level: expected 'regions' or 'surfaces', got {level!r}")
+    field = "labels" if level == "regions" else "surface_labels"
+    truth, machine = getattr(scene, field), getattr(result, field)
+    labels = evaluate_labels(
+        truth, machine, mask=scene.frame.valid, tolerances=tolerances, minimum_area=minimum_area
+    )
+    reconstruct = getattr(result, "reconstruct", None)
+    reconstruction = None if reconstruct is None else evaluate_reconstruction(*reconstruct(), scene)
+    return SceneMetrics(f"{scene.family}_{scene.seed:03d}", labels, None, reconstruction)
+
+
+@dataclass(frozen=True)
+class Pooled:
+    """Figures of several frames together: regions and objects are summed, the rest is averaged over frames.
+
+    `counts` holds, for each tolerance, the sums of truth regions, correct, over, under, missed and noise; `means` the
+    average of every other figure over the frames that have it (NaN left out), per-object figures weighted by
+    objects.
+    """
+
+    name: str
+    frames: int
+    counts: dict[float, dict[str, int]]
+    means: dict[str, float]
+
+    def correct(self, tolerance: float = REPORT_TOLERANCE) -> float:
+        """Correct detections over truth regions, both summed over all frames; NaN without region truth."""
+        counts = self.counts.get(tolerance)
+        return counts["correct"] / counts["truth_regions"] if counts else float("nan")
+
+    def row(self, tolerance: float = REPORT_TOLERANCE) -> dict[str, Any]:
+        row: dict[str, Any] = {"name": self.name, "frames": self.frames}
+        if tolerance in self.counts:
+            row |= {"correct_share": self.correct(tolerance), **self.counts[tolerance]}
+        return row | self.means
+
+
+_COUNTED = ("truth_regions", "correct", "over", "under", "missed", "noise")
+_PER_OBJECT = ("parts_per_object", "raw_parts_per_object", "best_iou")
+
+
+def pool(name: str, scenes: Sequence[SceneMetrics]) -> Pooled:
+    """Pool the figures of frames; see `Pooled`."""
+    counts: dict[float, dict[str, int]] = {}
+    for scene in scenes:
+        for result in scene.labels.hoover if scene.labels else ():
+            sums = counts.setdefault(result.tolerance, dict.fromkeys(_COUNTED, 0))
+            for key in _COUNTED:
+                sums[key] += getattr(result, key)
+    values: dict[str, list[tuple[float, float]]] = {}
+    for scene in scenes:
+        row = scene.row(scene.labels.hoover[0].tolerance) if scene.labels else scene.row()
+        for key, value in row.items():
+            if key not in ("frame", "objects", *_COUNTED) and np.isfinite(value):
+                weight = float(row["objects"]) if key in _PER_OBJECT else 1.0
+                values.setdefault(key, []).append((float(value), weight))
+    means = {key: float(np.average([v for v, _ in vs], weights=[w for _, w in vs])) for key, vs in values.items()}
+    return Pooled(name, len(scenes), counts, means)
