@@ -6,7 +6,9 @@ conventions hold everywhere:
 - pixels that are invalid in the input are nobody's: they count for no region (an algorithm is not asked about them);
 - truth regions smaller than 100 px at 640 x 480 (the same share of other sizes) after that are ignored together with their
   pixels: a sliver may be absorbed or found, neither is punished;
-- machine regions are never ignored for their size: whatever carries a label can be noise.
+- machine regions smaller than that are crumbs. For Hoover's classes their pixels count as unlabelled: taken literally, one
+  stray pixel with a label of its own turns the region round it from correct into over-segmented, because the pair
+  of them explains one pixel more. They are counted and shown beside the noise, and all other figures see them.
 """
 
 from __future__ import annotations
@@ -58,8 +60,8 @@ class LabelMetrics:
     coverage : float
         Share of truth pixels that carry a machine label.
     truth_regions, machine_regions : int
-    large_noise : int
-        Noise regions at the report tolerance that are no smaller than the least truth region; `hoover` counts all.
+    crumbs : int
+        Machine regions below the minimum area.
     """
 
     hoover: tuple[HooverResult, ...]
@@ -72,7 +74,7 @@ class LabelMetrics:
     coverage: float
     truth_regions: int
     machine_regions: int
-    large_noise: int
+    crumbs: int
 
     def at(self, tolerance: float = REPORT_TOLERANCE) -> HooverResult:
         """The classification at one tolerance of the sweep.
@@ -161,7 +163,7 @@ class SceneMetrics:
             result = self.labels.at(tolerance)
             for key in ("truth_regions", "correct", "over", "under", "missed", "noise"):
                 row[key] = getattr(result, key)
-            keys = ("large_noise", "machine_regions", "voi_bits", "rand", "adjusted_rand", "covering", "coverage")
+            keys = ("crumbs", "machine_regions", "voi_bits", "rand", "adjusted_rand", "covering", "coverage")
             row |= {key: getattr(self.labels, key) for key in keys}
         for group in (self.parts, self.reconstruction):
             if group is not None:
@@ -215,13 +217,11 @@ def evaluate_labels(
     table = contingency(truth, machine, without_slivers(truth, mask, minimum_area))
     if not len(table.truth_ids):
         raise InputError(f"truth: no region of at least {minimum_area:.0f} valid pixels; there is nothing to compare with")
-    results = sweep(table, tolerances)
+    solid = table.without_crumbs(minimum_area)
     split, merge = conditional_entropies(table.counts[1:])
     rand, adjusted = rand_indices(table.counts[1:])
-    nearest = min(results, key=lambda r: abs(r.tolerance - REPORT_TOLERANCE))
-    noise = np.array([kind == "noise" for kind in nearest.machine_class], bool)
     return LabelMetrics(
-        hoover=results,
+        hoover=sweep(solid, tolerances),
         voi_bits=split + merge,
         voi_split_bits=split,
         voi_merge_bits=merge,
@@ -231,7 +231,7 @@ def evaluate_labels(
         coverage=_coverage(table),
         truth_regions=len(table.truth_ids),
         machine_regions=len(table.machine_ids),
-        large_noise=int(np.count_nonzero(noise & (table.machine_sizes >= minimum_area))),
+        crumbs=len(table.machine_ids) - len(solid.machine_ids),
     )
 
 

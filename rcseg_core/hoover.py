@@ -61,6 +61,14 @@ class Contingency:
         """(M,): P[m], pixels without a truth region included."""
         return self.counts[:, 1:].sum(axis=0)
 
+    def without_crumbs(self, minimum_area: float) -> Contingency:
+        """The table with machine regions of less than `minimum_area` pixels turned into unlabelled pixels."""
+        kept = self.machine_sizes >= minimum_area
+        columns = np.concatenate([[True], kept])
+        counts = self.counts[:, columns].copy()
+        counts[:, 0] += self.counts[:, ~columns].sum(axis=1)
+        return Contingency(counts, self.truth_ids, self.machine_ids[kept])
+
 
 def contingency(truth: NDArray[Any], machine: NDArray[Any], mask: NDArray[np.bool_] | None = None) -> Contingency:
     """Count shared pixels.
