@@ -1,14 +1,16 @@
 """Figures that say how good a segmentation is: Hoover's classes, information, overlap, parts, reconstruction.
 
-All label figures come from one contingency table of truth and machine regions, so a frame costs milliseconds. Three
-conventions hold everywhere:
+All label figures come from one contingency table of truth and machine regions, so a frame costs
+milliseconds. Three conventions hold everywhere:
 
-- pixels that are invalid in the input are nobody's: they count for no region (an algorithm is not asked about them);
-- truth regions smaller than 100 px at 640 x 480 (the same share of other sizes) after that are ignored together with their
-  pixels: a sliver may be absorbed or found, neither is punished;
-- machine regions smaller than that are crumbs. For Hoover's classes their pixels count as unlabelled: taken literally, one
-  stray pixel with a label of its own turns the region round it from correct into over-segmented, because the pair
-  of them explains one pixel more. They are counted and shown beside the noise, and all other figures see them.
+- pixels that are invalid in the input are nobody's: they count for no region (an algorithm is not asked
+  about them);
+- truth regions smaller than 100 px at 640 x 480 (the same share of other sizes) after that are ignored
+  together with their pixels: a sliver may be absorbed or found, neither is punished;
+- machine regions smaller than that are crumbs. For Hoover's classes their pixels count as unlabelled: taken
+  literally, one stray pixel with a label of its own turns the region round it from correct into over-
+  segmented, because the pair of them explains one pixel more. They are counted and shown beside the noise,
+  and all other figures see them.
 """
 
 from __future__ import annotations
@@ -49,8 +51,8 @@ class LabelMetrics:
     hoover : tuple of HooverResult
         One for each tolerance of the sweep.
     voi_bits : float
-        Variation of information H(truth | machine) + H(machine | truth), base 2; 0 is perfect. Unlabelled pixels
-        form one machine region of their own.
+        Variation of information H(truth | machine) + H(machine | truth), base 2; 0 is perfect. Unlabelled
+        pixels form one machine region of their own.
     voi_split_bits, voi_merge_bits : float
         Its two terms: H(machine | truth) grows with over-, H(truth | machine) with under-segmentation.
     rand, adjusted_rand : float
@@ -100,15 +102,15 @@ class PartMetrics:
     purity : float
         Share of labelled truth pixels that lie in the truth object which holds most of their machine region.
     boundary_recall : float
-        Share of the pixels on a border of two truth objects that have a machine border within 2 px (Euclidean).
-        NaN when no two truth objects touch.
+        Share of the pixels on a border of two truth objects that have a machine border within 2 px
+        (Euclidean). NaN when no two truth objects touch.
     coverage : float
         Share of truth pixels that carry a machine label.
     parts_per_object : float
         Mean over objects. A machine region is a part of the object that holds most of it. It counts
-        min(1, pixels / s) with s the larger of 50 px (at 640 x 480) and 1 % of the object; each unlabelled pixel of the object
-        counts 1 / s. So crumbs count by their area: neither breaking a region into crumbs nor leaving
-        pixels unlabelled ever lowers the figure. An object without any part counts as 1.
+        min(1, pixels / s) with s the larger of 50 px (at 640 x 480) and 1 % of the object; each unlabelled
+        pixel of the object counts 1 / s. So crumbs count by their area: neither breaking a region into
+        crumbs nor leaving pixels unlabelled ever lowers the figure. An object without any part counts as 1.
     raw_parts_per_object : float
         The plain number of machine regions, of any size, that lie mainly in the object.
     best_iou : float
@@ -216,7 +218,9 @@ def evaluate_labels(
     minimum_area = least_area(truth.shape) if minimum_area is None else minimum_area
     table = contingency(truth, machine, without_slivers(truth, mask, minimum_area))
     if not len(table.truth_ids):
-        raise InputError(f"truth: no region of at least {minimum_area:.0f} valid pixels; there is nothing to compare with")
+        raise InputError(
+            f"truth: no region of at least {minimum_area:.0f} valid pixels; there is nothing to compare with"
+        )
     solid = table.without_crumbs(minimum_area)
     split, merge = conditional_entropies(table.counts[1:])
     rand, adjusted = rand_indices(table.counts[1:])
@@ -323,7 +327,8 @@ def evaluate_parts(
 
 
 def _count_parts(table: Contingency, crumb_px: float) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Raw and weighted number of parts of each truth region (N,); `PartMetrics.parts_per_object` has the rule."""
+    """Raw and weighted number of parts of each truth region (N,); `PartMetrics.parts_per_object` has the
+    rule."""
     scale = np.maximum(crumb_px, 0.01 * table.truth_sizes)
     unlabelled = table.counts[1:, 0] / scale
     raw = np.zeros(len(table.truth_ids), np.int64)
@@ -340,8 +345,8 @@ def boundary_recall(
 ) -> float:
     """Share of truth border pixels with a machine border within `within_px`; NaN without truth borders.
 
-    A pixel is on a border when a 4-neighbour has another label. On the truth both must be labelled; on the machine's
-    side a step to unlabelled counts, but never a step to a pixel that is invalid in the input.
+    A pixel is on a border when a 4-neighbour has another label. On the truth both must be labelled; on the
+    machine's side a step to unlabelled counts, but never a step to a pixel that is invalid in the input.
     """
     wanted = borders(truth, mask & (truth > 0))
     if not wanted.any():
@@ -421,9 +426,9 @@ def evaluate_scene(
 class Pooled:
     """Figures of several frames together: regions and objects are summed, the rest is averaged over frames.
 
-    `counts` holds, for each tolerance, the sums of truth regions, correct, over, under, missed and noise; `means` the
-    average of every other figure over the frames that have it (NaN left out), per-object figures weighted by
-    objects.
+    `counts` holds, for each tolerance, the sums of truth regions, correct, over, under, missed and noise;
+    `means` the average of every other figure over the frames that have it (NaN left out), per-object
+    figures weighted by objects.
     """
 
     name: str
@@ -462,5 +467,7 @@ def pool(name: str, scenes: Sequence[SceneMetrics]) -> Pooled:
             if key not in ("frame", "objects", *_COUNTED) and np.isfinite(value):
                 weight = float(row["objects"]) if key in _PER_OBJECT else 1.0
                 values.setdefault(key, []).append((float(value), weight))
-    means = {key: float(np.average([v for v, _ in vs], weights=[w for _, w in vs])) for key, vs in values.items()}
+    means = {
+        key: float(np.average([v for v, _ in vs], weights=[w for _, w in vs])) for key, vs in values.items()
+    }
     return Pooled(name, len(scenes), counts, means)

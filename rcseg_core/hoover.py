@@ -1,17 +1,18 @@
 """Hoover et al. (1996): every truth region and every machine region falls into exactly one class.
 
-A. Hoover et al., "An experimental comparison of range image segmentation algorithms", IEEE PAMI 18(7), 1996. One
-contingency table holds all that the definitions need: O[n, m] pixels that truth region n and machine region m share,
-their sizes P[n] and P[m]. For a tolerance T in (.5, 1]:
+A. Hoover et al., "An experimental comparison of range image segmentation algorithms", IEEE PAMI 18(7),
+1996. One contingency table holds all that the definitions need: O[n, m] pixels that truth region n and
+machine region m share, their sizes P[n] and P[m]. For a tolerance T in (.5, 1]:
 
 correct  n and m share at least T of both;
 over     n holds two or more machine regions by at least T of each, and they cover at least T of n;
 under    m holds two or more truth regions by at least T of each, and they cover at least T of m;
 missed   a truth region in none of these;   noise   a machine region in none of these.
 
-A region may satisfy up to three of the definitions at once. The instance with the largest average overlap then wins
-(the mean of the share of the truth and the share of the machine regions that it explains), ties in the order correct,
-over, under; an instance that lost one of its regions to a better one is void as a whole.
+A region may satisfy up to three of the definitions at once. The instance with the largest average overlap
+then wins (the mean of the share of the truth and the share of the machine regions that it explains), ties
+in the order correct, over, under; an instance that lost one of its regions to a better one is void as a
+whole.
 """
 
 from __future__ import annotations
@@ -70,7 +71,9 @@ class Contingency:
         return Contingency(counts, self.truth_ids, self.machine_ids[kept])
 
 
-def contingency(truth: NDArray[Any], machine: NDArray[Any], mask: NDArray[np.bool_] | None = None) -> Contingency:
+def contingency(
+    truth: NDArray[Any], machine: NDArray[Any], mask: NDArray[np.bool_] | None = None
+) -> Contingency:
     """Count shared pixels.
 
     Parameters
@@ -90,7 +93,9 @@ def contingency(truth: NDArray[Any], machine: NDArray[Any], mask: NDArray[np.boo
         if labels.size and labels.min() < 0:
             raise InputError(f"{name} labels: expected 0 (none) or positive numbers, got {labels.min()}")
     if truth.shape != machine.shape or (mask is not None and mask.shape != truth.shape):
-        shapes = f"truth {truth.shape}, machine {machine.shape}" + ("" if mask is None else f", mask {mask.shape}")
+        shapes = f"truth {truth.shape}, machine {machine.shape}" + (
+            "" if mask is None else f", mask {mask.shape}"
+        )
         raise InputError(f"labels must share one pixel grid, got {shapes}")
     if mask is not None:
         truth, machine = truth[mask], machine[mask]
@@ -112,7 +117,7 @@ def _compact(labels: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]
 
 
 class Instance(NamedTuple):
-    """One case of a definition: its class, the rows and columns of the table it joins, its average overlap."""
+    """One case of a definition: its class, the rows and columns of the table it joins, its overlap."""
 
     kind: str
     truth: tuple[int, ...]
@@ -207,7 +212,8 @@ def sweep(table: Contingency, tolerances: Sequence[float] = TOLERANCES) -> tuple
 def _correct(truth_share: NDArray[Any], machine_share: NDArray[Any], tolerance: float) -> list[Instance]:
     pairs = np.argwhere((truth_share >= tolerance) & (machine_share >= tolerance))
     return [
-        Instance(CORRECT, (int(n),), (int(m),), float(truth_share[n, m] + machine_share[n, m]) / 2) for n, m in pairs
+        Instance(CORRECT, (int(n),), (int(m),), float(truth_share[n, m] + machine_share[n, m]) / 2)
+        for n, m in pairs
     ]
 
 
@@ -219,7 +225,7 @@ def _split(
     part_share: NDArray[Any],
     tolerance: float,
 ) -> list[Instance]:
-    """Wholes (rows) that hold two or more parts (columns): over-segmentation, or transposed under-segmentation."""
+    """Wholes (rows) that hold two or more parts (columns): over-segmentation; transposed, under."""
     held = part_share >= tolerance
     held_pixels = np.where(held, overlap, 0).sum(axis=1)
     wholes = np.flatnonzero((held.sum(axis=1) >= 2) & (held_pixels >= tolerance * whole_sizes))
@@ -229,5 +235,7 @@ def _split(
         explained = held_pixels[whole] / whole_sizes[whole]
         average = float(explained + held_pixels[whole] / part_sizes[list(parts)].sum()) / 2
         one = (int(whole),)
-        found.append(Instance(kind, one, parts, average) if kind == OVER else Instance(kind, parts, one, average))
+        found.append(
+            Instance(kind, one, parts, average) if kind == OVER else Instance(kind, parts, one, average)
+        )
     return found

@@ -1,8 +1,9 @@
 """Analytic ray casting: planes, convex polyhedra, spheres and cylinders, all in vectorised numpy.
 
-A scene is a list of solids; every pixel is one ray; the nearest hit wins. Because each surface is a formula, the truth
-(depth, normal, surface identity) is exact to rounding, so whatever error an evaluation reports is the algorithm's own.
-With a pinhole ray direction (x, y, 1) the ray parameter t is the depth along the optical axis itself.
+A scene is a list of solids; every pixel is one ray; the nearest hit wins. Because each surface is a
+formula, the truth (depth, normal, surface identity) is exact to rounding, so whatever error an evaluation
+reports is the algorithm's own. With a pinhole ray direction (x, y, 1) the ray parameter t is the depth
+along the optical axis itself.
 """
 
 from __future__ import annotations
@@ -73,7 +74,8 @@ def random_rotation(rng: np.random.Generator) -> Array:
 
 @dataclass(frozen=True)
 class Plane:
-    """A plane through `point`; paint coordinates are metres along `first` and `second`. `half_size` bounds it."""
+    """A plane through `point`; paint coordinates are metres along `first` and `second`. `half_size` bounds
+    it."""
 
     point: Array
     first: Array
@@ -141,7 +143,8 @@ class Polyhedron:
 
 @dataclass(frozen=True)
 class Sphere:
-    """A ball; paint coordinates are the unit vector from the centre in the ball's own frame `rotation` (3, 3)."""
+    """A ball; paint coordinates are the unit vector from the centre in the ball's own frame `rotation` (3,
+    3)."""
 
     center: Array
     radius: float
@@ -167,7 +170,8 @@ class Sphere:
 
 @dataclass(frozen=True)
 class Cylinder:
-    """A closed cylinder. Faces: 0 side (coordinates: arc length and height), 1 and 2 the caps at +axis and -axis."""
+    """A closed cylinder. Faces: 0 side (coordinates: arc length and height), 1 and 2 the caps at +axis and
+    -axis."""
 
     center: Array
     axis: Array
@@ -257,7 +261,8 @@ def occluded(solids: list[Solid], points: Array, eye: Array) -> NDArray[np.bool_
 
 
 def box(base_center: Array, size: tuple[float, float, float], yaw: float) -> Polyhedron:
-    """A box of `size` (length, width, height) that stands on `base_center`, turned by `yaw` about the vertical z."""
+    """A box of `size` (length, width, height) that stands on `base_center`, turned by `yaw` about the
+    vertical z."""
     axes = np.array([[np.cos(yaw), np.sin(yaw), 0.0], [-np.sin(yaw), np.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
     center = np.asarray(base_center, float) + [0.0, 0.0, size[2] / 2]
     normals = np.concatenate([axes, -axes])
@@ -265,20 +270,27 @@ def box(base_center: Array, size: tuple[float, float, float], yaw: float) -> Pol
     return Polyhedron(normals, normals @ center + half, center, float(np.linalg.norm(size) / 2))
 
 
-def prism(base_center: Array, radius: float, height: float, sides: int, yaw: float, taper: float) -> Polyhedron:
+def prism(
+    base_center: Array, radius: float, height: float, sides: int, yaw: float, taper: float
+) -> Polyhedron:
     """A regular prism (taper 0) or a frustum whose sides lean inward by the angle `taper` (rad); z is up."""
     center = np.asarray(base_center, float) + [0.0, 0.0, height / 2]
     angle = yaw + 2 * np.pi * np.arange(sides) / sides
-    side = np.stack([np.cos(angle) * np.cos(taper), np.sin(angle) * np.cos(taper), np.full(sides, np.sin(taper))], 1)
+    side = np.stack(
+        [np.cos(angle) * np.cos(taper), np.sin(angle) * np.cos(taper), np.full(sides, np.sin(taper))], 1
+    )
     apothem = radius * np.cos(np.pi / sides)
-    foot = np.asarray(base_center, float) + apothem * np.stack([np.cos(angle), np.sin(angle), np.zeros(sides)], 1)
+    foot = np.asarray(base_center, float) + apothem * np.stack(
+        [np.cos(angle), np.sin(angle), np.zeros(sides)], 1
+    )
     normals = np.concatenate([side, [[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]])
     offsets = np.concatenate([np.sum(side * foot, 1), [base_center[2] + height, -base_center[2]]])
     return Polyhedron(normals, offsets, center, float(np.hypot(radius, height / 2)))
 
 
 def wedge(base_center: Array, size: tuple[float, float, float], yaw: float, slope: float) -> Polyhedron:
-    """A box whose top falls away along its length by the angle `slope` (rad), from full height at the high end."""
+    """A box whose top falls away along its length by the angle `slope` (rad), from full height at the high
+    end."""
     body = box(base_center, size, yaw)
     forward = body.normals[0]
     normal = np.sin(slope) * forward + np.cos(slope) * np.array([0.0, 0.0, 1.0])

@@ -1,8 +1,8 @@
 """Random layouts of the five families: which solids stand where, in which colours, seen from where.
 
-Each draw is meant to be plausible for a robot or for the paper's scanner, not easy: boxes turn by any angle, colours of
-different objects may coincide (depth tells them apart), while regions painted on one surface differ clearly, since
-nothing but colour separates them.
+Each draw is meant to be plausible for a robot or for the paper's scanner, not easy: boxes turn by any
+angle, colours of different objects may coincide (depth tells them apart), while regions painted on one
+surface differ clearly, since nothing but colour separates them.
 """
 
 from __future__ import annotations
@@ -41,7 +41,8 @@ class Layout:
 
 
 def camera_rotation(yaw: float, pitch: float, roll: float) -> Array:
-    """Rows right, down, forward of a camera that looks along world +y, turned right by yaw, down by pitch (rad)."""
+    """Rows right, down, forward of a camera that looks along world +y, turned right by yaw, down by pitch
+    (rad)."""
     forward = np.array([np.sin(yaw) * np.cos(pitch), np.cos(yaw) * np.cos(pitch), -np.sin(pitch)])
     right = np.array([np.cos(yaw), -np.sin(yaw), 0.0])
     down = np.cross(forward, right)
@@ -49,8 +50,11 @@ def camera_rotation(yaw: float, pitch: float, roll: float) -> Array:
     return turn @ np.stack([right, down, forward])
 
 
-def aimed_pose(rng: np.random.Generator, heights: tuple[float, float], distances: tuple[float, float]) -> tuple[Array, Array]:
-    """Rotation and position of a camera over the origin that looks at a point ahead of it, a hand above the floor."""
+def aimed_pose(
+    rng: np.random.Generator, heights: tuple[float, float], distances: tuple[float, float]
+) -> tuple[Array, Array]:
+    """Rotation and position of a camera over the origin that looks at a point ahead of it, a hand above the
+    floor."""
     height, distance = rng.uniform(*heights), rng.uniform(*distances)
     pitch = np.arctan((height - rng.uniform(0.1, 0.5)) / distance)
     rotation = camera_rotation(rng.uniform(-0.2, 0.2), pitch, rng.uniform(-0.05, 0.05))
@@ -62,17 +66,29 @@ def random_color(rng: np.random.Generator) -> Array:
 
 
 class Footprints:
-    """Places objects on the floor so that their footprints (circles) neither overlap nor leave the free area."""
+    """Places objects on the floor so that their footprints (circles) neither overlap nor leave the free
+    area."""
 
     def __init__(self, rng: np.random.Generator, free: Callable[[Array, float], bool]) -> None:
         self.rng, self.free = rng, free
         self.taken: list[tuple[Array, float]] = []
 
     def place(self, radius: float, near: float, far: float, spread: float) -> Array | None:
-        """A free base point (3,) at a distance near..far ahead, sideways up to spread * distance; None if full."""
+        """A free base point (3,) at a distance near..far ahead, sideways up to spread * distance; None if
+        full."""
+        return self._try(radius, lambda: self._ahead(near, far, spread))
+
+    def drop(self, radius: float, half: tuple[float, float]) -> Array | None:
+        """A free base point (3,) within a rectangle round the origin; None if full."""
+        return self._try(radius, lambda: np.append(self.rng.uniform(-1, 1, 2) * half, 0.0))
+
+    def _ahead(self, near: float, far: float, spread: float) -> Array:
+        ahead = self.rng.uniform(near, far)
+        return np.array([self.rng.uniform(-spread, spread) * ahead, ahead, 0.0])
+
+    def _try(self, radius: float, draw: Callable[[], Array]) -> Array | None:
         for _ in range(60):
-            ahead = self.rng.uniform(near, far)
-            point = np.array([self.rng.uniform(-spread, spread) * ahead, ahead, 0.0])
+            point = draw()
             clear = all(np.linalg.norm(point - other) > radius + r + 0.02 for other, r in self.taken)
             if clear and self.free(point, radius):
                 self.taken.append((point, radius))
@@ -104,7 +120,9 @@ def painted_ball(rng: np.random.Generator, center: Array, radius: float) -> Soli
     return Solid(Sphere(center, radius, random_rotation(rng)), (Paint(base, regions),), "ball")
 
 
-def painted_cylinder(rng: np.random.Generator, center: Array, axis: Array, radius: float, half: float) -> Solid:
+def painted_cylinder(
+    rng: np.random.Generator, center: Array, axis: Array, radius: float, half: float
+) -> Solid:
     """A cylinder of one colour, or with a label round its middle; the caps have the base colour."""
     base = random_color(rng)
     side = Paint(base)
@@ -120,7 +138,9 @@ def standing_plane(point: Array, along: Array, paint: Paint, name: str) -> Solid
     return Solid(Plane(point, along, UP), (paint,), name)
 
 
-def _walls(rng: np.random.Generator, back: float, sides: tuple[float, float]) -> tuple[list[Solid], Array, Array]:
+def _walls(
+    rng: np.random.Generator, back: float, sides: tuple[float, float]
+) -> tuple[list[Solid], Array, Array]:
     yaw = rng.uniform(-0.45, 0.45)
     along = np.array([np.cos(yaw), np.sin(yaw), 0.0])
     away = np.array([-np.sin(yaw), np.cos(yaw), 0.0])
@@ -144,14 +164,17 @@ def _floor(rng: np.random.Generator, rug_ahead: tuple[float, float]) -> Solid:
     rug: tuple = ()
     if rng.random() < 0.4:
         middle, half = (rng.uniform(-0.6, 0.6), rng.uniform(*rug_ahead)), tuple(rng.uniform(0.25, 0.7, 2))
-        shape = rectangle(middle, half, rng.uniform(0, np.pi)) if rng.random() < 0.6 else ellipse(middle, half)
+        shape = (
+            rectangle(middle, half, rng.uniform(0, np.pi)) if rng.random() < 0.6 else ellipse(middle, half)
+        )
         rug = ((shape, distinct_colors(rng, 1, avoid=base)[0]),)
     plane = Plane(np.zeros(3), np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]))
     return Solid(plane, (Paint(base, rug),), "floor")
 
 
 def room(rng: np.random.Generator) -> Layout:
-    """Floor, three walls, boxes (one may carry another), a standing cylinder and a ball, as a robot sees them."""
+    """Floor, three walls, boxes (one may carry another), a standing cylinder and a ball, as a robot sees
+    them."""
     back, sides = rng.uniform(2.2, 3.5), (rng.uniform(0.9, 2.0), rng.uniform(0.9, 2.0))
     walls, along, away = _walls(rng, back, sides)
 
@@ -182,7 +205,8 @@ def room(rng: np.random.Generator) -> Layout:
 
 
 def blocks(rng: np.random.Generator) -> Layout:
-    """Boxes, prisms, frusta and wedges on a floor before a wall, all of one grey: only geometry tells them apart."""
+    """Boxes, prisms, frusta and wedges on a floor before a wall, all of one grey: only geometry tells them
+    apart."""
     grey = Paint(np.full(3, rng.uniform(110, 190)))
     back = rng.uniform(1.5, 2.4)
     places = Footprints(rng, lambda point, radius: bool(point[1] + radius + 0.3 * abs(point[0]) < back))
@@ -204,7 +228,14 @@ def blocks(rng: np.random.Generator) -> Layout:
             shape = wedge(base, size, turn, min(slope, float(np.arctan(0.9 * size[2] / size[0]))))
         else:
             taper = 0.0 if kind == "prism" else rng.uniform(0.2, 0.5)
-            shape = prism(base, radius, min(size[2], 0.5 * radius / max(np.tan(taper), 1e-3)), int(rng.integers(3, 7)), turn, taper)
+            shape = prism(
+                base,
+                radius,
+                min(size[2], 0.5 * radius / max(np.tan(taper), 1e-3)),
+                int(rng.integers(3, 7)),
+                turn,
+                taper,
+            )
         solids.append(Solid(shape, (grey,), str(kind)))
     return Layout(solids, *aimed_pose(rng, (0.55, 1.1), (0.9, 1.4)), KINECT_SIGMA_INVERSE_M)
 

@@ -1,7 +1,7 @@
 """What is painted on a surface: a base colour, regions of other colours, slow variation, printed texture.
 
-Regions are albedo, part of the truth (surface x albedo). Variation and texture are not: they are what a real board or a
-printed box does to a segmentation that believes in one colour a region.
+Regions are albedo, part of the truth (surface x albedo). Variation and texture are not: they are what a
+real board or a printed box does to a segmentation that believes in one colour a region.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ Array = NDArray[np.float64]
 Mask = Callable[[Array], NDArray[np.bool_]]
 
 LEAST_DIFFERENCE = 45.0
-"""Least distance, in the largest channel and in 0-255 levels, of two colours that are told apart by colour alone."""
+"""Least distance, in the largest channel and in 0-255 levels, of two colours that are told apart by colour
+alone."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,8 @@ class Paint:
     texture: Callable[[Array], Array] | None = None
 
     def index(self, coords: Array) -> NDArray[np.int32]:
-        """Number of the paint at face coordinates (N, 2 or 3): (N,) int32, 0 the base, i + 1 the i-th region."""
+        """Number of the paint at face coordinates (N, 2 or 3): (N,) int32, 0 the base, i + 1 the i-th
+        region."""
         index = np.zeros(len(coords), np.int32)
         for number, (mask, _) in enumerate(self.regions, start=1):
             index[mask(coords)] = number
@@ -51,9 +53,15 @@ class Paint:
 
 
 def distinct_colors(
-    rng: np.random.Generator, count: int, *, avoid: Array | None = None, low: float = 40.0, high: float = 230.0
+    rng: np.random.Generator,
+    count: int,
+    *,
+    avoid: Array | None = None,
+    low: float = 40.0,
+    high: float = 230.0,
 ) -> Array:
-    """Random colours (count, 3), each at least LEAST_DIFFERENCE levels (largest channel) from the others and `avoid`.
+    """Random colours (count, 3), each at least LEAST_DIFFERENCE levels (largest channel) from the others
+    and `avoid`.
 
     Raises
     ------
@@ -69,7 +77,9 @@ def distinct_colors(
         if all(np.max(np.abs(color - other)) >= LEAST_DIFFERENCE for other in found):
             found.append(color)
     else:
-        raise InputError(f"distinct_colors: {count} colours {LEAST_DIFFERENCE:g} levels apart do not fit; ask for fewer")
+        raise InputError(
+            f"distinct_colors: {count} colours {LEAST_DIFFERENCE:g} levels apart do not fit; ask for fewer"
+        )
     return np.array(found[given:]).reshape(count, 3)
 
 
@@ -107,7 +117,8 @@ def disc(direction: Array, cos_angle: float) -> Mask:
 
 
 def random_texture(rng: np.random.Generator, scale_m: float) -> Callable[[Array], Array]:
-    """A printed pattern as a factor on the albedo, 0.45-1: stripes, checks or text-like blocks of about `scale_m`."""
+    """A printed pattern as a factor on the albedo, 0.45-1: stripes, checks or text-like blocks of about
+    `scale_m`."""
     kind = rng.choice(["stripes", "checks", "blocks"])
     angle, dark = rng.uniform(0, np.pi), rng.uniform(0.45, 0.75)
     turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])

@@ -1,4 +1,5 @@
-"""The two scenes of the paper's section 8: a billiard ball of coloured regions and wide colour bands on a flat board.
+"""The two scenes of the paper's section 8: a billiard ball of coloured regions and wide colour bands on a
+flat board.
 
 Both are seen by a scanner on a regular x, y grid (parallel rays along z), so there is no camera model.
 """
@@ -41,7 +42,9 @@ def _stroke(center: Array, along: Array, half: tuple[float, float]) -> Mask:
     return mask
 
 
-def _number_disc(center: Array, along: Array, strokes: int, white: Array, ink: Array) -> list[tuple[Mask, Array]]:
+def _number_disc(
+    center: Array, along: Array, strokes: int, white: Array, ink: Array
+) -> list[tuple[Mask, Array]]:
     """A white disc with one to three bars of ink in it."""
     painted = [(disc(center, np.cos(0.36)), white)]
     across = np.cross(center, along)
@@ -53,7 +56,8 @@ def _number_disc(center: Array, along: Array, strokes: int, white: Array, ink: A
 
 
 def _ball_paint(rng: np.random.Generator, to_scanner: Array) -> Paint:
-    """A striped ball, a solid one with spots, or a patchwork; each with a number disc towards the scanner, more or less."""
+    """A striped ball, a solid one with spots, or a patchwork; each with a number disc towards the scanner,
+    more or less."""
     kind = rng.choice(["striped", "spots", "patchwork"])
     colors = distinct_colors(rng, 9)
     regions: list[tuple[Mask, Array]] = []
@@ -61,7 +65,9 @@ def _ball_paint(rng: np.random.Generator, to_scanner: Array) -> Paint:
         width, ring = rng.uniform(0.35, 0.6), rng.uniform(0.08, 0.14)
         regions.append((band(2, -width, width), colors[1]))
         regions.append((band(2, width, width + ring), colors[2]))
-        regions += [(disc(np.array([0.0, 0.0, s]), np.cos(0.4)), c) for s, c in ((1.0, colors[3]), (-1.0, colors[4]))]
+        regions += [
+            (disc(np.array([0.0, 0.0, s]), np.cos(0.4)), c) for s, c in ((1.0, colors[3]), (-1.0, colors[4]))
+        ]
     elif kind == "spots":
         centers: list[Array] = []
         while len(centers) < 6:
@@ -70,11 +76,12 @@ def _ball_paint(rng: np.random.Generator, to_scanner: Array) -> Paint:
                 centers.append(direction)
         regions += [(disc(c, np.cos(rng.uniform(0.2, 0.36))), colors[1 + i]) for i, c in enumerate(centers)]
     else:
-        for i, quarter in enumerate(range(-2, 2)):
-            low, high = quarter * np.pi / 2, (quarter + 1) * np.pi / 2
-            upper = (lambda low, high: lambda p: _sector(p, low, high) & (p[:, 2] >= 0))(low, high)
-            lower = (lambda low, high: lambda p: _sector(p, low, high) & (p[:, 2] < 0))(low, high)
-            regions += [(upper, colors[1 + i]), (lower, colors[1 + (i + 2) % 4])]
+        for i in range(4):
+            start = (i - 2) * np.pi / 2
+            regions += [
+                (_octant(start, upper=True), colors[1 + i]),
+                (_octant(start, upper=False), colors[1 + (i + 2) % 4]),
+            ]
     towards = to_scanner + rng.uniform(0.0, 1.0) * _unit(rng)
     towards /= np.linalg.norm(towards)
     along = np.cross(towards, _unit(rng))
@@ -83,13 +90,19 @@ def _ball_paint(rng: np.random.Generator, to_scanner: Array) -> Paint:
     return Paint(colors[0], tuple(regions))
 
 
-def _sector(coords: Array, low: float, high: float) -> NDArray[np.bool_]:
-    angle = np.arctan2(coords[:, 1], coords[:, 0])
-    return np.asarray((angle >= low) & (angle < high))
+def _octant(start: float, *, upper: bool) -> Mask:
+    """An eighth of the ball: a quarter turn from the longitude `start`, above or below the equator."""
+
+    def mask(coords: Array) -> NDArray[np.bool_]:
+        angle = np.arctan2(coords[:, 1], coords[:, 0])
+        return np.asarray((angle >= start) & (angle < start + np.pi / 2) & ((coords[:, 2] >= 0) == upper))
+
+    return mask
 
 
 def billiard(rng: np.random.Generator) -> tuple[list[Solid], float, float]:
-    """The billiard ball, alone or on a plate. Returns solids, height of the image (m) and sigma of range (m)."""
+    """The billiard ball, alone or on a plate. Returns solids, height of the image (m) and sigma of range
+    (m)."""
     radius = rng.uniform(0.024, 0.031)
     height_m = 2 * radius / rng.uniform(0.72, 0.9)
     slack = height_m / 2 - radius
@@ -108,7 +121,9 @@ def billiard(rng: np.random.Generator) -> tuple[list[Solid], float, float]:
 
 def _wavy(rng: np.random.Generator, level: float, size: float) -> Callable[[Array], Array]:
     """A brush's edge: `level` plus two slow waves along the stroke; metres."""
-    waves = [(rng.uniform(0.002, 0.008) * size, rng.uniform(2, 9) / size, rng.uniform(0, 6.3)) for _ in range(2)]
+    waves = [
+        (rng.uniform(0.002, 0.008) * size, rng.uniform(2, 9) / size, rng.uniform(0, 6.3)) for _ in range(2)
+    ]
     return lambda s: level + sum(a * np.sin(k * s + phase) for a, k, phase in waves)
 
 
@@ -121,7 +136,11 @@ def painting(rng: np.random.Generator) -> tuple[list[Solid], float, float]:
     """Wide colour bands on a flat board, some crossed by another. Returns as `billiard`."""
     height_m = rng.uniform(0.2, 0.4)
     whole = rng.random() < 0.5
-    half = (0.8 * height_m, 0.6 * height_m) if whole else tuple(height_m * rng.uniform([0.5, 0.38], [0.62, 0.47]))
+    half = (
+        (0.8 * height_m, 0.6 * height_m)
+        if whole
+        else tuple(height_m * rng.uniform([0.5, 0.38], [0.62, 0.47]))
+    )
     count, crossing = int(rng.integers(4, 8)), int(rng.integers(0, 2))
     colors = distinct_colors(rng, count + crossing + 1)
     reach = min(half[1], 0.5 * height_m) * rng.uniform(0.9, 1.0)
@@ -136,7 +155,9 @@ def painting(rng: np.random.Generator) -> tuple[list[Solid], float, float]:
         regions.append((_stripe(1, edges[i], end), colors[1 + i]))
     for i in range(crossing):
         at, wide = rng.uniform(-0.4, 0.4) * height_m, rng.uniform(0.05, 0.1) * height_m
-        regions.append((_stripe(0, _wavy(rng, at - wide, height_m), _wavy(rng, at + wide, height_m)), colors[-1 - i]))
+        regions.append(
+            (_stripe(0, _wavy(rng, at - wide, height_m), _wavy(rng, at + wide, height_m)), colors[-1 - i])
+        )
     slope, phase = rng.uniform(-4, 4, (2, 3)) / height_m, rng.uniform(0, 6.3, 3)
     variation = rng.uniform(1.0, 4.0, 3)
     paint = Paint(colors[0], tuple(regions), lambda c: variation * np.sin(c[:, :2] @ slope + phase))
