@@ -1,0 +1,146 @@
+"""Results as a rosbag2 folder (mcap) that `ros2 bag play` and Foxglove read, written without ROS.
+
+The messages are those that the node publishes, of the same types and topic names; the definitions of
+rcseg_msgs are taken from the .msg files with their comments, so that the bag explains its own fields.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from rosbags.interfaces import (
+    Connection,
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+from rcseg_core.errors import InputError
+from rcseg_ros.bag import Topic
+
+NAMESPACE = "/rcseg"  # the node's name: its ~/labels is /rcseg/labels
+_HERE = Path(__file__).resolve().parent
+_SEPARATOR = "=" * 80 + "\n"
+
+
+def _qos(durability: QosDurability) -> Qos:
+    never = QosTime(9223372036, 854775807)  # how rosbag2 writes an infinite duration
+    return Qos(
+        QosHistory.KEEP_LAST, 10, QosReliability.RELIABLE, durability, never, never,
+        QosLiveliness.AUTOMATIC, never, False,
+    )  # fmt: skip
+
+
+@lru_cache(maxsize=1)
+def message_definitions() -> dict[str, str]:
+    """Text of each rcseg_msgs definition by type name, as installed with rcseg or from the source tree."""
+    folder = next((f for f in (_HERE / "msg", _HERE.parent / "rcseg_msgs" / "msg") if f.is_dir()), None)
+    if folder is None:
+        raise InputError("the definitions of rcseg_msgs are missing: reinstall rcseg")
+    return {f"rcseg_msgs/msg/{path.stem}": path.read_text("utf-8") for path in sorted(folder.glob("*.msg"))}
+
+
+@lru_cache(maxsize=1)
+def result_types() -> Typestore:
+    """Message types of ROS 2 Jazzy and of rcseg_msgs."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    types: dict[str, Any] = {}
+    for name, text in message_definitions().items():
+        types.update(get_types_from_msg(text, name))
+    store.register(types)
+    return store
+
+
+def make_message(type_name: str, **fields: Any) -> Any:
+    """Build a message that recordings hold; all fields are to be given, arrays as numpy arrays."""
+    return result_types().types[type_name](**fields)
+
+
+def serialize(message: Any) -> bytes:
+    """CDR bytes of a message built by `make_message`."""
+    return bytes(result_types().serialize_cdr(message, message.__msgtype__))
+
+
+def definition_text(type_name: str) -> str:
+    """Definition of a type and of all that it contains, in the form of an mcap schema, our comments kept."""
+    text, _ = result_types().generate_msgdef(type_name, ros_version=2)
+    own = message_definitions()
+    head, *parts = text.split(_SEPARATOR)
+    sections = [own.get(type_name, head)]
+    for part in parts:
+        title, body = part.split("\n", 1)
+        package, name = title.removeprefix("MSG: ").split("/")
+        sections.append(f"{title}\n{own.get(f'{package}/msg/{name}', body)}")
+    return _SEPARATOR.join(section if section.endswith("\n") else section + "\n" for section in sections)
+
+
+@dataclass(frozen=True)
+class Output:
+    """A serialised result: name of the topic below the node's, type, CDR bytes."""
+
+    topic: str
+    type: str
+    data: bytes
+
+
+class ResultBag:
+    """A result bag that is being written; `close` makes it readable, whatever happened before.
+
+    Parameters
+    ----------
+    folder : must not exist yet
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._writer = Writer(folder, version=Writer.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP)
+        self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+        self._writer.open()
+        self._connections: dict[str, Connection] = {}
+
+    def write(self, output: Output, log_ns: int) -> None:
+        """Add a result."""
+        topic = f"{NAMESPACE}/{output.topic}"
+        if topic not in self._connections:
+            self._connections[topic] = self._writer.add_connection(
+                topic,
+                output.type,
+                msgdef=definition_text(output.type),
+                rihs01=result_types().hash_rihs01(output.type),
+                offered_qos_profiles=[_qos(QosDurability.VOLATILE)],
+            )
+        self._writer.write(self._connections[topic], log_ns, output.data)
+
+    def copy(self, topic: Topic, data: bytes, log_ns: int) -> None:
+        """Add a message of the input as it is (transforms, for instance)."""
+        if topic.name not in self._connections:
+            durability = (
+                QosDurability.TRANSIENT_LOCAL if topic.name == "/tf_static" else QosDurability.VOLATILE
+            )
+            self._connections[topic.name] = self._writer.add_connection(
+                topic.name,
+                topic.type,
+                typestore=result_types(),
+                offered_qos_profiles=topic.qos or [_qos(durability)],
+            )
+        self._writer.write(self._connections[topic.name], log_ns, data)
+
+    def close(self) -> None:
+        self._writer.close()
+
+    def __enter__(self) -> ResultBag:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
