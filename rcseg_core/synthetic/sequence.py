@@ -70,7 +70,7 @@ def make_tabletop_sequence(
     rng = np.random.default_rng([seed, *FAMILY.encode()])
     solids = _table_scene(rng)
     start, rise = rng.uniform(-0.2, 0.2) - sweep_rad / 2, rng.uniform(-0.1, 0.15)
-    radius, height_m = rng.uniform(0.95, 1.15), TABLE_HEIGHT_M + rng.uniform(0.5, 0.6)
+    radius, height_m = rng.uniform(0.8, 0.95), TABLE_HEIGHT_M + rng.uniform(0.45, 0.55)
     camera = default_camera(width, height)
     scenes = []
     for shot in range(frames):
