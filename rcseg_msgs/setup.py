@@ -1,8 +1,9 @@
 """Build the messages against the ROS wheels of PyPI, so that `pip install ./rcseg_msgs` works without ROS.
 
-setuptools runs the same CMakeLists.txt that colcon runs, installs it into a scratch tree, and ships that tree: the
-Python package as the wheel's package, everything else (libraries, headers, ament index) as data files, which pip lays
-into the environment's prefix. The environment thereby stays the ament prefix that the wheels make of it.
+setuptools runs the same CMakeLists.txt that colcon runs, installs it into a scratch tree, and ships that
+tree: the Python package as the wheel's package, everything else (libraries, headers, ament index) as data
+files, which pip lays into the environment's prefix. The environment thereby stays the ament prefix that the
+wheels make of it.
 """
 
 import os
@@ -20,7 +21,7 @@ PACKAGE = "rcseg_msgs"
 
 
 def ament_prefix() -> Path:
-    """Return the prefix that the generators' wheels were installed into (pip's build environment, not sys.prefix)."""
+    """Prefix that the generators' wheels lie in: pip's build environment, not sys.prefix."""
     for module in ("rosidl_adapter", "rosidl_generator_py"):
         spec = find_spec(module)
         for parent in Path(spec.origin).parents if spec and spec.origin else ():
@@ -62,7 +63,7 @@ class CMakeBuild(build_ext):
         self.collect(stage)
 
     def collect(self, stage: Path) -> None:
-        """Copy the generated Python package to build_lib and declare every other file as data of the prefix."""
+        """Copy the generated Python package to build_lib; every other file is data of the prefix."""
         (package,) = stage.rglob(f"*-packages/{PACKAGE}")
         unwanted = shutil.ignore_patterns("__pycache__", "*.c")
         shutil.copytree(package, Path(self.build_lib) / PACKAGE, dirs_exist_ok=True, ignore=unwanted)
@@ -70,7 +71,9 @@ class CMakeBuild(build_ext):
         folders: dict[str, list[str]] = {}
         for path in sorted(stage.rglob("*")):
             if path.is_file() and python_tree not in path.parents:
-                folders.setdefault(str(path.parent.relative_to(stage)), []).append(os.path.relpath(path, HERE))
+                folders.setdefault(str(path.parent.relative_to(stage)), []).append(
+                    os.path.relpath(path, HERE)
+                )
         self.distribution.data_files = list(folders.items())
 
 

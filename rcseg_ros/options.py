@@ -1,7 +1,7 @@
 """The node's own parameters, beside the algorithm's: what it listens to, how it pairs, which QoS it asks for.
 
-One flat list in the form of the core's `describe`, so that one walk declares all of them as ROS parameters and writes
-config/default.yaml. Knows no ROS. `python -m rcseg_ros.options` prints that file.
+One flat list in the form of the core's `describe`, so that one walk declares all of them as ROS parameters
+and writes config/default.yaml. Knows no ROS. `python -m rcseg_ros.options` prints that file.
 """
 
 from __future__ import annotations
@@ -12,36 +12,38 @@ from rcseg_core import SegmenterConfig
 from rcseg_core.config import Parameter, describe
 
 
-def _option(key: str, default: Any, doc: str, unit: str = "", low: Any = None, high: Any = None, choices: Any = ()) -> Parameter:
+def _option(
+    key: str, default: Any, doc: str, unit: str = "", low: Any = None, high: Any = None, choices: Any = ()
+) -> Parameter:
     return Parameter(key, default, default, type(default), unit, low, high, tuple(choices), "", doc)
 
 
 NODE_PARAMETERS = (
     _option("autostart", True, "configure and activate at start, without a lifecycle manager"),
     _option(
-        "input.range_from", "auto", "points: PointCloud2; depth: Image (REP 118); auto: whichever arrives first",
+        "input.range_from", "auto", "points: PointCloud2; depth: Image (REP 118); auto: what arrives first",
         choices=("auto", "points", "depth"),
     ),
     _option(
-        "input.color_from", "auto", "image: topic image; cloud: the cloud's rgb field; auto: image where one is published",
+        "input.color_from", "auto", "image: topic; cloud: its rgb field; auto: image where one is published",
         choices=("auto", "image", "cloud"),
     ),
     _option(
         "input.camera", "auto",
-        "required: wait for camera_info; none: never use it; auto: wait for it where it is published or must be known",
+        "required: wait for camera_info; none: never use it; auto: wait where it is published",
         choices=("auto", "required", "none"),
     ),
-    _option("input.queue", 1, "paired frames that may wait; beyond it the oldest is dropped and counted", "frames", 1, 100),
+    _option("input.queue", 1, "paired frames that may wait; then the oldest is dropped", "frames", 1, 100),
     _option(
         "input.extrinsic_translation", (0.0, 0.0, 0.0),
-        "origin of the cloud's frame seen from the camera's, for clouds that are projected", "m", -100.0, 100.0,
+        "cloud's origin seen from the camera, for clouds that are projected", "m", -100.0, 100.0,
     ),
     _option(
         "input.extrinsic_rotation", (0.0, 0.0, 0.0, 1.0),
-        "rotation of the cloud's frame seen from the camera's, quaternion x, y, z, w", "", -1.0, 1.0,
+        "cloud's rotation seen from the camera, quaternion x, y, z, w", "", -1.0, 1.0,
     ),
     _option("input.use_tf", False, "take the extrinsic from tf2 (where tf2_ros is installed) instead"),
-    _option("sync.slop_ms", 20.0, "largest difference of the stamps of one pair; an exact match always wins", "ms", 0.0, 10000.0),
+    _option("sync.slop_ms", 20.0, "largest difference of stamps in a pair; exact wins", "ms", 0.0, 10000.0),
     _option("sync.queue", 10, "messages of a topic that wait for their partner", "messages", 1, 1000),
     _option(
         "qos.reliability", "auto",
@@ -49,7 +51,7 @@ NODE_PARAMETERS = (
         choices=("auto", "reliable", "best_effort"),
     ),
     _option("qos.depth", 5, "history of the subscriptions", "messages", 1, 1000),
-    _option("diagnostics.warn_period_s", 10.0, "a rejection of one kind is warned of once in this time", "s", 0.1, 3600.0),
+    _option("diagnostics.warn_period_s", 10.0, "each kind of rejection is warned of once a period", "s", 0.1, 3600.0),
 )  # fmt: skip
 
 # Taken over between two frames; the others build subscriptions and are read at configure.

@@ -1,13 +1,15 @@
 """Configuration as ROS parameters: declared by one walk over the config, checked by the config itself.
 
-The config is frozen and replaced as a whole, so the worker, which reads `config` once a frame, sees a change of one
-parameter or of a whole atomic set between two frames or not at all. What the config refuses is refused with its words.
+The config is frozen and replaced as a whole, so the worker, which reads `config` once a frame, sees a
+change of one parameter or of a whole atomic set between two frames or not at all. What the config refuses
+is refused with its words.
 """
 
 from __future__ import annotations
 
 import difflib
-from typing import Any, Callable
+from collections.abc import Callable
+from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
@@ -57,7 +59,9 @@ class NodeParameters:
         for key in getattr(self._node, "_parameter_overrides", {}):
             if key not in known and not key.startswith(_FOREIGN):
                 near = difflib.get_close_matches(key, known, n=1)
-                sentences.append(f"unknown parameter {key} is ignored" + (f"; did you mean {near[0]}?" if near else ""))
+                sentences.append(
+                    f"unknown parameter {key} is ignored" + (f"; did you mean {near[0]}?" if near else "")
+                )
         return sentences
 
     def _build_config(self) -> SegmenterConfig:
@@ -99,7 +103,9 @@ def _declare(node: Node, parameter: Parameter) -> None:
         given = node._parameter_overrides[parameter.key].value  # the exceptions do not all carry it
         hint = " (write a decimal point)" if parameter.type is float and isinstance(given, int) else ""
         kind = "list of numbers" if parameter.type is tuple else parameter.type.__name__
-        raise ConfigError(f"{parameter.key} = {given!r}: expected {kind} {allowed(parameter)}{hint}") from error
+        raise ConfigError(
+            f"{parameter.key} = {given!r}: expected {kind} {allowed(parameter)}{hint}"
+        ) from error
 
 
 def _descriptor(parameter: Parameter) -> ParameterDescriptor:
@@ -110,9 +116,13 @@ def _descriptor(parameter: Parameter) -> ParameterDescriptor:
     if parameter.choices:
         descriptor.additional_constraints = "one of: " + ", ".join(parameter.choices)
     if parameter.type is int and parameter.low is not None:
-        descriptor.integer_range = [IntegerRange(from_value=int(parameter.low), to_value=int(parameter.high or 0), step=1)]
+        descriptor.integer_range = [
+            IntegerRange(from_value=int(parameter.low), to_value=int(parameter.high or 0), step=1)
+        ]
     elif parameter.type is float and parameter.low is not None:
         descriptor.floating_point_range = [
-            FloatingPointRange(from_value=float(parameter.low), to_value=float(parameter.high or 0.0), step=0.0)
+            FloatingPointRange(
+                from_value=float(parameter.low), to_value=float(parameter.high or 0.0), step=0.0
+            )
         ]
     return descriptor

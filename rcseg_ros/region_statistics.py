@@ -1,8 +1,9 @@
 """What the region messages hold beside the patches: the mean colour and an oriented box of each region.
 
-One compiled pass sums the members' moments, a second one measures their spread along each region's own axes; the cost
-does not depend on the number of regions. The axes are those of the member points' covariance: z along the least spread
-(the normal of the best plane), x along the largest, right-handed, signs fixed so that a scene always gives one answer.
+One compiled pass sums the members' moments, a second one measures their spread along each region's own
+axes; the cost does not depend on the number of regions. The axes are those of the member points'
+covariance: z along the least spread (the normal of the best plane), x along the largest, right-handed,
+signs fixed so that a scene always gives one answer.
 """
 
 from __future__ import annotations
@@ -63,7 +64,7 @@ _SQUARE = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])  # where xx, xy, xz, yy, y
 
 
 def _right_handed_axes(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rotation of each (3, 3) covariance: columns by falling spread, x's largest component positive, z to the sensor."""
+    """Rotation of each (3, 3) covariance: x along the largest spread, z along the least, to the sensor."""
     _, vectors = np.linalg.eigh(covariance)
     x, z = vectors[:, :, 2], vectors[:, :, 0]
     largest = np.take_along_axis(x, np.abs(x).argmax(axis=1)[:, None], axis=1)
