@@ -21,12 +21,14 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
+from rcseg_core import agreement
+from rcseg_core.datasets import REGIONS
 from rcseg_core.errors import InputError
-from rcseg_core.hoover import TOLERANCES, Contingency, HooverResult, contingency, sweep
+from rcseg_core.hoover import TOLERANCES, HooverResult, contingency, sweep
 
 if TYPE_CHECKING:
+    from rcseg_core.datasets import LabelledFrame
     from rcseg_core.synthetic import SyntheticScene
 
 LEAST_AREA_SHARE = 100 / (640 * 480)
@@ -151,26 +153,35 @@ class ReconstructionMetrics:
 
 @dataclass(frozen=True)
 class SceneMetrics:
-    """All figures of one frame; None where its truth does not allow them."""
+    """All figures of one frame; None where its truth does not allow them.
+
+    `regions`: machine regions in the image; `labelled`: share of the valid pixels that carry a label.
+    """
 
     name: str
+    regions: int
+    labelled: float
     labels: LabelMetrics | None = None
     parts: PartMetrics | None = None
     reconstruction: ReconstructionMetrics | None = None
 
-    def row(self, tolerance: float = REPORT_TOLERANCE) -> dict[str, Any]:
-        """Flat name -> number, as tables and CSV files need it."""
-        row: dict[str, Any] = {"frame": self.name}
+    def figures(self) -> dict[str, float]:
+        """All figures but Hoover's classes, by name."""
+        found = {"regions": float(self.regions), "labelled": self.labelled}
         if self.labels is not None:
-            result = self.labels.at(tolerance)
-            for key in ("truth_regions", "correct", "over", "under", "missed", "noise"):
-                row[key] = getattr(result, key)
-            keys = ("crumbs", "machine_regions", "voi_bits", "rand", "adjusted_rand", "covering", "coverage")
-            row |= {key: getattr(self.labels, key) for key in keys}
+            keys = ("crumbs", "voi_bits", "rand", "adjusted_rand", "covering", "coverage")
+            found |= {key: float(getattr(self.labels, key)) for key in keys}
         for group in (self.parts, self.reconstruction):
             if group is not None:
-                row |= asdict(group)
-        return row
+                found |= asdict(group)
+        return found
+
+    def row(self, tolerance: float = REPORT_TOLERANCE) -> dict[str, Any]:
+        """Flat name -> number for tables and CSV files, with Hoover's classes at one tolerance."""
+        row: dict[str, Any] = {"frame": self.name}
+        if self.labels is not None:
+            row |= self.labels.at(tolerance).counts()
+        return row | self.figures()
 
 
 def least_area(shape: tuple[int, ...]) -> float:
@@ -222,8 +233,8 @@ def evaluate_labels(
             f"truth: no region of at least {minimum_area:.0f} valid pixels; there is nothing to compare with"
         )
     solid = table.without_crumbs(minimum_area)
-    split, merge = conditional_entropies(table.counts[1:])
-    rand, adjusted = rand_indices(table.counts[1:])
+    split, merge = agreement.conditional_entropies(table.counts[1:])
+    rand, adjusted = agreement.rand_indices(table.counts[1:])
     return LabelMetrics(
         hoover=sweep(solid, tolerances),
         voi_bits=split + merge,
@@ -231,59 +242,12 @@ def evaluate_labels(
         voi_merge_bits=merge,
         rand=rand,
         adjusted_rand=adjusted,
-        covering=covering(table),
-        coverage=_coverage(table),
+        covering=agreement.covering(table),
+        coverage=agreement.coverage(table),
         truth_regions=len(table.truth_ids),
         machine_regions=len(table.machine_ids),
         crumbs=len(table.machine_ids) - len(solid.machine_ids),
     )
-
-
-def conditional_entropies(counts: NDArray[np.int64]) -> tuple[float, float]:
-    """H(column | row) and H(row | column) in bits of a table of counts."""
-    p = counts / counts.sum()
-    rows, cols = p.sum(axis=1, keepdims=True), p.sum(axis=0, keepdims=True)
-    some = p > 0
-    given_row = -np.sum(p[some] * np.log2((p / np.where(rows > 0, rows, 1))[some]))
-    given_col = -np.sum(p[some] * np.log2((p / np.where(cols > 0, cols, 1))[some]))
-    return max(float(given_row), 0.0), max(float(given_col), 0.0)
-
-
-def rand_indices(counts: NDArray[np.int64]) -> tuple[float, float]:
-    """Rand index and adjusted Rand index (Hubert & Arabie 1985) of a table of counts."""
-    n = float(counts.sum())
-    pairs = n * (n - 1) / 2
-    if pairs == 0:
-        return 1.0, 1.0
-    together = _pairs(counts).sum()
-    in_rows, in_cols = _pairs(counts.sum(axis=1)).sum(), _pairs(counts.sum(axis=0)).sum()
-    rand = float((pairs + 2 * together - in_rows - in_cols) / pairs)
-    expected = in_rows * in_cols / pairs
-    most = (in_rows + in_cols) / 2
-    return rand, float((together - expected) / (most - expected)) if most > expected else 1.0
-
-
-def _pairs(counts: NDArray[np.int64]) -> NDArray[np.float64]:
-    values = counts.astype(float)
-    return values * (values - 1) / 2
-
-
-def intersection_over_union(table: Contingency) -> NDArray[np.float64]:
-    """(N, M)"""
-    union = table.truth_sizes[:, None] + table.machine_sizes[None, :] - table.overlap
-    return table.overlap / np.maximum(union, 1)
-
-
-def covering(table: Contingency) -> float:
-    """Arbelaez et al. 2011: sum over truth regions of their share of the pixels times their best IoU."""
-    if not len(table.machine_ids):
-        return 0.0
-    best = intersection_over_union(table).max(axis=1)
-    return float(best @ table.truth_sizes / table.truth_sizes.sum())
-
-
-def _coverage(table: Contingency) -> float:
-    return float(1 - table.counts[1:, 0].sum() / table.counts[1:].sum())
 
 
 def evaluate_parts(
@@ -312,62 +276,18 @@ def evaluate_parts(
     objects = ~np.isin(table.truth_ids, list(background))
     if not objects.any():
         raise InputError("truth: no object of sufficient size; there is nothing to compare with")
-    best = intersection_over_union(table).max(axis=1, initial=0.0)
-    raw, parts = _count_parts(table, 0.5 * least_area(truth.shape))
+    best = agreement.intersection_over_union(table).max(axis=1, initial=0.0)
+    raw, parts = agreement.count_parts(table, 0.5 * least_area(truth.shape))
     labelled = table.overlap.sum()
     return PartMetrics(
         purity=float(table.overlap.max(axis=0, initial=0).sum() / labelled) if labelled else 0.0,
-        boundary_recall=boundary_recall(truth, machine, mask),
-        coverage=_coverage(table),
+        boundary_recall=agreement.boundary_recall(truth, machine, mask),
+        coverage=agreement.coverage(table),
         parts_per_object=float(parts[objects].mean()),
         raw_parts_per_object=float(raw[objects].mean()),
         best_iou=float(best[objects].mean()),
         objects=int(objects.sum()),
     )
-
-
-def _count_parts(table: Contingency, crumb_px: float) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Raw and weighted number of parts of each truth region (N,); `PartMetrics.parts_per_object` has the
-    rule."""
-    scale = np.maximum(crumb_px, 0.01 * table.truth_sizes)
-    unlabelled = table.counts[1:, 0] / scale
-    raw = np.zeros(len(table.truth_ids), np.int64)
-    weighted = unlabelled.astype(float)
-    for part in np.flatnonzero(table.overlap.sum(axis=0)):
-        owner = int(np.argmax(table.overlap[:, part]))
-        raw[owner] += 1
-        weighted[owner] += min(1.0, table.overlap[owner, part] / scale[owner])
-    return raw, np.maximum(weighted, 1.0)
-
-
-def boundary_recall(
-    truth: NDArray[Any], machine: NDArray[Any], mask: NDArray[np.bool_], *, within_px: float = 2.0
-) -> float:
-    """Share of truth border pixels with a machine border within `within_px`; NaN without truth borders.
-
-    A pixel is on a border when a 4-neighbour has another label. On the truth both must be labelled; on the
-    machine's side a step to unlabelled counts, but never a step to a pixel that is invalid in the input.
-    """
-    wanted = borders(truth, mask & (truth > 0))
-    if not wanted.any():
-        return float("nan")
-    drawn = borders(machine, mask)
-    if not drawn.any():
-        return 0.0
-    distance = ndimage.distance_transform_edt(~drawn)
-    return float(np.count_nonzero(distance[wanted] <= within_px) / np.count_nonzero(wanted))
-
-
-def borders(labels: NDArray[Any], mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Pixels (H, W) of `mask` with a 4-neighbour in `mask` of another label."""
-    border = np.zeros(labels.shape, bool)
-    down = (labels[1:] != labels[:-1]) & mask[1:] & mask[:-1]
-    right = (labels[:, 1:] != labels[:, :-1]) & mask[:, 1:] & mask[:, :-1]
-    border[1:] |= down
-    border[:-1] |= down
-    border[:, 1:] |= right
-    border[:, :-1] |= right
-    return border
 
 
 def evaluate_reconstruction(
@@ -410,64 +330,64 @@ def evaluate_scene(
     InputError
         Unknown level, or as `evaluate_labels`.
     """
+    machine = choose_labels(result, level)
+    truth = scene.labels if level == "regions" else scene.surface_labels
+    valid = scene.frame.valid
+    labels = evaluate_labels(truth, machine, mask=valid, tolerances=tolerances, minimum_area=minimum_area)
+    reconstruct = getattr(result, "reconstruct", None)
+    return SceneMetrics(
+        name=f"{scene.family}_{scene.seed:03d}",
+        regions=int(np.count_nonzero(np.bincount(machine.ravel())[1:])),
+        labelled=float(np.mean(machine[valid] > 0)),
+        labels=labels,
+        reconstruction=None if reconstruct is None else evaluate_reconstruction(*reconstruct(), scene),
+    )
+
+
+def evaluate_frame(
+    frame: LabelledFrame,
+    result: HasLabels,
+    *,
+    level: str = "surfaces",
+    tolerances: Sequence[float] = TOLERANCES,
+    minimum_area: float | None = None,
+) -> SceneMetrics:
+    """The figures that the truth of a recorded frame allows: Hoover's for regions, parts for objects.
+
+    Without truth only the number of regions and the labelled share are given.
+
+    Raises
+    ------
+    InputError
+        Unknown level, or as `evaluate_labels` and `evaluate_parts`.
+    """
+    machine = choose_labels(result, level)
+    valid, labels, parts = frame.frame.valid, None, None
+    if frame.truth is not None and frame.kind == REGIONS:
+        labels = evaluate_labels(
+            frame.truth, machine, mask=valid, tolerances=tolerances, minimum_area=minimum_area
+        )
+    elif frame.truth is not None:
+        parts = evaluate_parts(
+            frame.truth, machine, mask=valid, background=frame.background, minimum_area=minimum_area
+        )
+    return SceneMetrics(
+        name=frame.name,
+        regions=int(np.count_nonzero(np.bincount(machine.ravel())[1:])),
+        labelled=float(np.mean(machine[valid] > 0)),
+        labels=labels,
+        parts=parts,
+    )
+
+
+def choose_labels(result: HasLabels, level: str) -> NDArray[np.int32]:
+    """`labels` or `surface_labels` of a result.
+
+    Raises
+    ------
+    InputError
+        Unless level is "regions" or "surfaces".
+    """
     if level not in ("regions", "surfaces"):
         raise InputError(f"level: expected 'regions' or 'surfaces', got {level!r}")
-    field = "labels" if level == "regions" else "surface_labels"
-    truth, machine = getattr(scene, field), getattr(result, field)
-    labels = evaluate_labels(
-        truth, machine, mask=scene.frame.valid, tolerances=tolerances, minimum_area=minimum_area
-    )
-    reconstruct = getattr(result, "reconstruct", None)
-    reconstruction = None if reconstruct is None else evaluate_reconstruction(*reconstruct(), scene)
-    return SceneMetrics(f"{scene.family}_{scene.seed:03d}", labels, None, reconstruction)
-
-
-@dataclass(frozen=True)
-class Pooled:
-    """Figures of several frames together: regions and objects are summed, the rest is averaged over frames.
-
-    `counts` holds, for each tolerance, the sums of truth regions, correct, over, under, missed and noise;
-    `means` the average of every other figure over the frames that have it (NaN left out), per-object
-    figures weighted by objects.
-    """
-
-    name: str
-    frames: int
-    counts: dict[float, dict[str, int]]
-    means: dict[str, float]
-
-    def correct(self, tolerance: float = REPORT_TOLERANCE) -> float:
-        """Correct detections over truth regions, both summed over all frames; NaN without region truth."""
-        counts = self.counts.get(tolerance)
-        return counts["correct"] / counts["truth_regions"] if counts else float("nan")
-
-    def row(self, tolerance: float = REPORT_TOLERANCE) -> dict[str, Any]:
-        row: dict[str, Any] = {"name": self.name, "frames": self.frames}
-        if tolerance in self.counts:
-            row |= {"correct_share": self.correct(tolerance), **self.counts[tolerance]}
-        return row | self.means
-
-
-_COUNTED = ("truth_regions", "correct", "over", "under", "missed", "noise")
-_PER_OBJECT = ("parts_per_object", "raw_parts_per_object", "best_iou")
-
-
-def pool(name: str, scenes: Sequence[SceneMetrics]) -> Pooled:
-    """Pool the figures of frames; see `Pooled`."""
-    counts: dict[float, dict[str, int]] = {}
-    for scene in scenes:
-        for result in scene.labels.hoover if scene.labels else ():
-            sums = counts.setdefault(result.tolerance, dict.fromkeys(_COUNTED, 0))
-            for key in _COUNTED:
-                sums[key] += getattr(result, key)
-    values: dict[str, list[tuple[float, float]]] = {}
-    for scene in scenes:
-        row = scene.row(scene.labels.hoover[0].tolerance) if scene.labels else scene.row()
-        for key, value in row.items():
-            if key not in ("frame", "objects", *_COUNTED) and np.isfinite(value):
-                weight = float(row["objects"]) if key in _PER_OBJECT else 1.0
-                values.setdefault(key, []).append((float(value), weight))
-    means = {
-        key: float(np.average([v for v, _ in vs], weights=[w for _, w in vs])) for key, vs in values.items()
-    }
-    return Pooled(name, len(scenes), counts, means)
+    return result.labels if level == "regions" else result.surface_labels

@@ -170,6 +170,11 @@ class HooverResult:
     def truth_regions(self) -> int:
         return len(self.truth_class)
 
+    def counts(self) -> dict[str, int]:
+        """Truth regions and the number in each class; the first four classes add up to the truth regions."""
+        keys = ("truth_regions", "correct", "over", "under", "missed", "noise")
+        return {key: int(getattr(self, key)) for key in keys}
+
 
 def classify(table: Contingency, tolerance: float) -> HooverResult:
     """Hoover's classification at one tolerance.

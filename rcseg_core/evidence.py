@@ -1,0 +1,256 @@
+"""How well two regions go together (section 6), from their moments alone.
+
+bounded (default): one joint model must explain BOTH sides: for each side s and each modality
+    RSS_s(joint) - RSS_s(own)  <  p + 4 sqrt(2 p)  +  n_s (share^2 + eps^2)        (everything in sigma^2)
+The first term is what noise alone costs, the second what the approximation limit eps_t allows; the value is the
+largest ratio of left to right, so 1 is the limit and the measure is symmetric.
+chow: the same for the total rise of both sides at once.
+bayes: c_ib of eq. (21), the larger region predicts the smaller (the other way extrapolation explodes).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rcseg_core.jit import kernel
+from rcseg_core.moments import UNIT_PX, Moments, residual, shift_grid, solve
+from rcseg_core.signals import local_scales
+
+BOUNDED, CHOW, BAYES = 0, 1, 2
+KINDS = {"bounded": BOUNDED, "chow": CHOW, "bayes": BAYES}
+
+
+class Rule(NamedTuple):
+    """What a comparison goes by, the same for all pairs of a pass.
+
+    kind : BOUNDED, CHOW or BAYES; n_range, channels : int; law, color_eps2 : see Signals;
+    share2 : squared noise share; beta2 : beta^2 of eq. (20); use_range, use_color : whether a modality counts;
+    terms : exponents of the models by degree, (p, 2) int64 each; terms[1] is a plane or the bilinear form;
+    degree : (N + 1, 2) int64, degree of range and colour of each region; a pair takes the higher of the two (step 6)
+    """
+
+    kind: int
+    n_range: int
+    channels: int
+    law: NDArray[np.float64]
+    color_eps2: float
+    share2: float
+    beta2: float
+    use_range: bool
+    use_color: bool
+    terms: tuple[NDArray[np.int64], ...]
+    degree: NDArray[np.int64]
+
+
+class Work(NamedTuple):
+    """Scratch arrays of one thread for `compare`."""
+
+    shift: NDArray[np.float64]
+    power: NDArray[np.float64]
+    cross: NDArray[np.float64]
+    sum_power: NDArray[np.float64]
+    sum_cross: NDArray[np.float64]
+    sum_energy: NDArray[np.float64]
+    gram: NDArray[np.float64]
+    coef: NDArray[np.float64]
+
+
+def make_work(moments: Moments) -> Work:
+    """Scratch arrays that fit `moments`."""
+    channels, size, low = moments.energy.shape[1], moments.power.shape[1], moments.cross.shape[2]
+    p = low * low
+    return Work(
+        np.empty((size, size)),
+        np.empty((size, size)),
+        np.empty((channels, low, low)),
+        np.empty((size, size)),
+        np.empty((channels, low, low)),
+        np.empty(channels),
+        np.empty((p + 1, max(p, 3))),
+        np.empty((channels, max(p, 3))),
+    )
+
+
+@kernel
+def move(moments, k, center_x, center_y, work, power, cross):  # type: ignore[no-untyped-def]
+    """Sums of region k about another centre (px), into power and cross."""
+    dx = (moments.center[k, 0] - center_x) / UNIT_PX
+    dy = (moments.center[k, 1] - center_y) / UNIT_PX
+    shift_grid(moments.power[k], dx, dy, power, work.shift)
+    low = cross.shape[1]
+    part = work.shift[:low, :low]
+    for c in range(cross.shape[0]):
+        shift_grid(moments.cross[k, c], dx, dy, cross[c], part)
+
+
+@kernel
+def channel_span(rule, modality):  # type: ignore[no-untyped-def]
+    """First channel and one past the last of a modality: 0 range, 1 colour."""
+    if modality == 0:
+        return 0, rule.n_range
+    return rule.n_range, rule.channels
+
+
+@kernel
+def own_residuals(moments, k, rule, work, out):  # type: ignore[no-untyped-def]
+    """Residual sums of squares of region k about its own models: out[0] range, out[1] colour."""
+    for modality in range(2):
+        first, last = channel_span(rule, modality)
+        terms = rule.terms[rule.degree[k, modality]]
+        solve(moments.power[k], moments.cross[k], first, last, terms, work.gram, work.coef)
+        out[modality] = residual(
+            moments.power[k], moments.cross[k], moments.energy[k], first, last, terms, work.coef
+        )
+
+
+@kernel
+def _excess(rise, allowance, budget):  # type: ignore[no-untyped-def]
+    """(ratio of rise to all that is allowed, share of the tolerance that is needed)."""
+    ratio = rise / (allowance + budget)
+    need = rise - allowance
+    if need <= 0.0:
+        return ratio, 0.0
+    if budget <= 0.0:
+        return ratio, np.inf
+    return ratio, np.sqrt(need / budget)
+
+
+@kernel
+def _bounded(moments, big, small, rule, own, gate_r, gate_c, work):  # type: ignore[no-untyped-def]
+    """Largest ratio over sides and modalities (or of the totals), and the multiple of the tolerance it needs."""
+    n_big = moments.power[big, 0, 0]
+    n_small = moments.power[small, 0, 0]
+    value = 0.0
+    height = 0.0
+    for modality in range(2):
+        if (modality == 0 and not rule.use_range) or (modality == 1 and not rule.use_color):
+            continue
+        first, last = channel_span(rule, modality)
+        terms = rule.terms[max(rule.degree[big, modality], rule.degree[small, modality])]
+        solve(work.sum_power, work.sum_cross, first, last, terms, work.gram, work.coef)
+        if modality == 0:
+            var, eps2 = local_scales(rule.law, work.sum_cross[0, 0, 0] / (n_big + n_small))
+            eps2 *= gate_r * gate_r
+        else:
+            var = 1.0
+            eps2 = rule.color_eps2 * gate_c * gate_c
+        p = np.float64(terms.shape[0] * (last - first))
+        noise = var * (p + 4.0 * np.sqrt(2.0 * p))
+        share = rule.share2 * var
+        rise_big = (
+            residual(moments.power[big], moments.cross[big], moments.energy[big], first, last, terms, work.coef)
+            - own[big, modality]
+        )
+        rise_small = (
+            residual(work.power, work.cross, moments.energy[small], first, last, terms, work.coef)
+            - own[small, modality]
+        )
+        if rule.kind == CHOW:
+            n = n_big + n_small
+            ratio, need = _excess(rise_big + rise_small, noise + n * share, n * eps2)
+            value = max(value, ratio)
+            height = max(height, need)
+        else:
+            ratio, need = _excess(rise_big, noise + n_big * share, n_big * eps2)
+            value = max(value, ratio)
+            height = max(height, need)
+            ratio, need = _excess(rise_small, noise + n_small * share, n_small * eps2)
+            value = max(value, ratio)
+            height = max(height, need)
+    return value, height
+
+
+@kernel
+def trace_inverse(moments, k, box, terms, work):  # type: ignore[no-untyped-def]
+    """Tr R^-1 of region k on its local domain, its box scaled to [-1, 1] in x and y; inf if R is singular."""
+    p = terms.shape[0]
+    half_x = max(0.5 * (box[3] - box[1]), 0.5) / UNIT_PX
+    half_y = max(0.5 * (box[2] - box[0]), 0.5) / UNIT_PX
+    gram = work.gram
+    for i in range(p):
+        for j in range(i + 1):
+            a = terms[i, 0] + terms[j, 0]
+            b = terms[i, 1] + terms[j, 1]
+            total = moments.power[k, a, b] / (half_x**a * half_y**b)
+            for m in range(j):
+                total -= gram[i, m] * gram[j, m]
+            if i == j:
+                if total <= 1e-9:
+                    return np.inf
+                gram[i, i] = np.sqrt(total)
+            else:
+                gram[i, j] = total / gram[j, j]
+    # Tr (L L^T)^-1 is the squared Frobenius norm of L^-1, found column by column
+    trace = 0.0
+    column = gram[p]
+    for j in range(p):
+        for i in range(j, p):
+            total = 1.0 if i == j else 0.0
+            for m in range(j, i):
+                total -= gram[i, m] * column[m]
+            column[i] = total / gram[i, i]
+            trace += column[i] * column[i]
+    return trace
+
+
+@kernel
+def _bayes(moments, big, small, rule, own, boxes, work):  # type: ignore[no-untyped-def]
+    """c_ib of eq. (21) for i = small, b = big, over n_i; and the average extrapolation error against the limits.
+
+    Returns (c_ib / n_i, e): grouping may go on while e <= 1 (section 8: the average extrapolation error of range
+    and of colour each under its own threshold).
+    """
+    n_small = moments.power[small, 0, 0]
+    n_big = moments.power[big, 0, 0]
+    value = 0.0
+    height = 0.0
+    box = boxes[big]
+    for modality in range(2):
+        if (modality == 0 and not rule.use_range) or (modality == 1 and not rule.use_color):
+            continue
+        first, last = channel_span(rule, modality)
+        terms = rule.terms[rule.degree[big, modality]]
+        # the big region's sums are about its own centre, and the small one's were moved there
+        solve(moments.power[big], moments.cross[big], first, last, terms, work.gram, work.coef)
+        sigma2_ib = residual(work.power, work.cross, moments.energy[small], first, last, terms, work.coef)  # eq. (18)
+        p = terms.shape[0]
+        dof = max(n_big - p, 1.0)
+        sigma2_b = own[big, modality] / dof
+        prior = sigma2_b * trace_inverse(moments, big, box, terms, work) / (rule.beta2 * dof)  # eq. (19)-(20)
+        value += (sigma2_ib + prior) / n_small  # eq. (21)
+        var, eps2 = local_scales(rule.law, work.sum_cross[0, 0, 0] / (n_big + n_small))
+        limit = eps2 + (last - first) * var if modality == 0 else rule.color_eps2 + (last - first)
+        height = max(height, np.sqrt(sigma2_ib / n_small / limit))
+    return value, height
+
+
+@kernel
+def compare(moments, i, j, rule, own, boxes, gate_r, gate_c, work):  # type: ignore[no-untyped-def]
+    """Compare two regions.
+
+    own : (N, 2) residuals of each region's own models; gate_r, gate_c : shares of the boundary free of edges
+
+    Returns
+    -------
+    value : float, order of the grouping (smaller is merged first)
+    height : float, multiple of the approximation limit that the grouping needs (0: noise alone explains it)
+    allowed : bool, whether the grouping stays within the limit
+    """
+    big, small = (i, j) if moments.power[i, 0, 0] >= moments.power[j, 0, 0] else (j, i)
+    move(moments, small, moments.center[big, 0], moments.center[big, 1], work, work.power, work.cross)
+    low = work.sum_cross.shape[1]
+    for a in range(work.sum_power.shape[0]):
+        for b in range(work.sum_power.shape[0]):
+            work.sum_power[a, b] = moments.power[big, a, b] + work.power[a, b]
+    for c in range(work.sum_cross.shape[0]):
+        for a in range(low):
+            for b in range(low):
+                work.sum_cross[c, a, b] = moments.cross[big, c, a, b] + work.cross[c, a, b]
+    if rule.kind == BAYES:
+        value, height = _bayes(moments, big, small, rule, own, boxes, work)
+        return value, height, height <= 1.0
+    value, height = _bounded(moments, big, small, rule, own, gate_r, gate_c, work)
+    return value, height, value <= 1.0

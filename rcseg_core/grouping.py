@@ -1,0 +1,309 @@
+"""Steps 3, 4 and 6: best-first grouping of adjacent regions until the best grouping exceeds the limit (section 6).
+
+A heap holds every allowed pair; the best is merged, its moments added, and the pairs around it compared again.
+Entries made stale by a merge are left in the heap and skipped when they surface (lazy invalidation). Ties are
+broken by (value, lower id, higher id): a frame always gives the same labels. Nothing here touches a pixel.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rcseg_core.adjacency import Pairs
+from rcseg_core.evidence import Rule, Work, compare, make_work, move, own_residuals
+from rcseg_core.jit import kernel
+from rcseg_core.moments import Moments
+
+#: All pairs of a region are compared again once it has grown by this; before that only those of the smaller side.
+GROWTH = 1.3
+
+
+class Graph(NamedTuple):
+    """Incidence lists over half-edges: half-edge 2e is edge e seen from ends[e, 0], 2e + 1 from ends[e, 1].
+
+    ends : (E, 2) int64; first, last : (N,) int64 half-edge or -1; following : (2E,) int64;
+    alive : (E,) bool; version : (E,) int64; boundary, range_crossed, color_crossed : (E,) float64;
+    height : (E,) float64, multiple of the approximation limit that the pair needed when last compared
+    """
+
+    ends: NDArray[np.int64]
+    first: NDArray[np.int64]
+    last: NDArray[np.int64]
+    following: NDArray[np.int64]
+    alive: NDArray[np.bool_]
+    version: NDArray[np.int64]
+    boundary: NDArray[np.float64]
+    range_crossed: NDArray[np.float64]
+    color_crossed: NDArray[np.float64]
+    height: NDArray[np.float64]
+
+
+def make_graph(pairs: Pairs, count: int) -> Graph:
+    """Incidence lists of regions 1..count; the arrays of `pairs` are copied."""
+    n = pairs.nodes.shape[0]
+    graph = Graph(
+        pairs.nodes.copy(),
+        np.full(count + 1, -1, np.int64),
+        np.full(count + 1, -1, np.int64),
+        np.full(2 * n, -1, np.int64),
+        np.ones(n, np.bool_),
+        np.zeros(n, np.int64),
+        pairs.boundary.copy(),
+        pairs.range_crossed.copy(),
+        pairs.color_crossed.copy(),
+        np.zeros(n),
+    )
+    _link(graph)
+    return graph
+
+
+@kernel
+def _link(graph):  # type: ignore[no-untyped-def]
+    for half in range(2 * graph.ends.shape[0]):
+        _append(graph, graph.ends[half // 2, half % 2], half)
+
+
+@kernel
+def _append(graph, node, half):  # type: ignore[no-untyped-def]
+    if graph.first[node] < 0:
+        graph.first[node] = half
+    else:
+        graph.following[graph.last[node]] = half
+    graph.last[node] = half
+    graph.following[half] = -1
+
+
+@kernel
+def _less(a, b):  # type: ignore[no-untyped-def]
+    if a[0] != b[0]:
+        return a[0] < b[0]
+    if a[1] != b[1]:
+        return a[1] < b[1]
+    return a[2] < b[2]
+
+
+@kernel
+def _push(heap, size, value, low, high, edge, version):  # type: ignore[no-untyped-def]
+    """Sift up one (value, low, high, edge, version); returns the heap, doubled where it was full."""
+    if size == heap.shape[0]:
+        bigger = np.empty((2 * size + 16, 5))
+        bigger[:size] = heap
+        heap = bigger
+    at = size
+    heap[at, 0] = value
+    heap[at, 1] = low
+    heap[at, 2] = high
+    heap[at, 3] = edge
+    heap[at, 4] = version
+    while at > 0:
+        up = (at - 1) // 2
+        if not _less(heap[at], heap[up]):
+            break
+        for k in range(5):
+            heap[at, k], heap[up, k] = heap[up, k], heap[at, k]
+        at = up
+    return heap
+
+
+@kernel
+def _pop(heap, size):  # type: ignore[no-untyped-def]
+    """Drop the top of a heap of `size` entries (the caller has read it)."""
+    last = size - 1
+    for k in range(5):
+        heap[0, k] = heap[last, k]
+    at = 0
+    while True:
+        child = 2 * at + 1
+        if child >= last:
+            break
+        if child + 1 < last and _less(heap[child + 1], heap[child]):
+            child += 1
+        if not _less(heap[child], heap[at]):
+            break
+        for k in range(5):
+            heap[at, k], heap[child, k] = heap[child, k], heap[at, k]
+        at = child
+
+
+@kernel
+def _evaluate(graph, edge, moments, rule, own, boxes, gated, limit, work, heap, size):  # type: ignore[no-untyped-def]
+    """Compare the ends of an edge; push the pair if it is allowed. Returns (heap, size)."""
+    graph.version[edge] += 1
+    i = graph.ends[edge, 0]
+    j = graph.ends[edge, 1]
+    gate_r = 1.0
+    gate_c = 1.0
+    if gated:
+        gate_r -= graph.range_crossed[edge] / graph.boundary[edge]
+        gate_c -= graph.color_crossed[edge] / graph.boundary[edge]
+    value, height, allowed = compare(moments, i, j, rule, own, boxes, gate_r, gate_c, work)
+    if allowed or height <= limit:
+        graph.height[edge] = height
+        heap = _push(heap, size, value, min(i, j), max(i, j), edge, graph.version[edge])
+        return heap, size + 1
+    return heap, size
+
+
+@kernel
+def _absorb_moments(moments, big, small, work):  # type: ignore[no-untyped-def]
+    """Add the sums of `small` to those of `big`, about the centre of `big`."""
+    move(moments, small, moments.center[big, 0], moments.center[big, 1], work, work.power, work.cross)
+    moments.power[big] += work.power
+    moments.cross[big] += work.cross
+    moments.energy[big] += moments.energy[small]
+
+
+@kernel
+def _recenter(moments, k, box, work):  # type: ignore[no-untyped-def]
+    """Move the origin back to the middle of the box once it is off by more than a quarter of its size."""
+    x = 0.5 * (box[1] + box[3])
+    y = 0.5 * (box[0] + box[2])
+    off_x = abs(moments.center[k, 0] - x)
+    off_y = abs(moments.center[k, 1] - y)
+    if off_x > 0.25 * (box[3] - box[1]) + 1.0 or off_y > 0.25 * (box[2] - box[0]) + 1.0:
+        move(moments, k, x, y, work, work.power, work.cross)
+        moments.power[k] = work.power
+        moments.cross[k] = work.cross
+        moments.center[k, 0] = x
+        moments.center[k, 1] = y
+
+
+@kernel
+def _join(keep, gone, moments, rule, boxes, own, work):  # type: ignore[no-untyped-def]
+    """Region `keep` takes in `gone`: moments, box, the higher degree of the two, and its own residuals anew."""
+    _absorb_moments(moments, keep, gone, work)
+    boxes[keep, 0] = min(boxes[keep, 0], boxes[gone, 0])
+    boxes[keep, 1] = min(boxes[keep, 1], boxes[gone, 1])
+    boxes[keep, 2] = max(boxes[keep, 2], boxes[gone, 2])
+    boxes[keep, 3] = max(boxes[keep, 3], boxes[gone, 3])
+    _recenter(moments, keep, boxes[keep], work)
+    for modality in range(2):
+        rule.degree[keep, modality] = max(rule.degree[keep, modality], rule.degree[gone, modality])
+    own_residuals(moments, keep, rule, work, own[keep])
+
+
+@kernel
+def _merge_edges(graph, keep, gone, seen, fresh):  # type: ignore[no-untyped-def]
+    """Give the edges of `gone` to `keep`; parallel edges become one. `fresh[edge]` marks what must be compared."""
+    # edges of keep, by neighbour
+    half = graph.first[keep]
+    graph.first[keep] = -1
+    while half >= 0:
+        following = graph.following[half]
+        edge = half // 2
+        other = graph.ends[edge, 1 - half % 2]
+        if graph.alive[edge]:
+            if other == gone:
+                graph.alive[edge] = False
+            else:
+                seen[other] = edge
+                _append(graph, keep, half)
+        half = following
+    half = graph.first[gone]
+    while half >= 0:
+        following = graph.following[half]
+        edge = half // 2
+        if graph.alive[edge]:
+            other = graph.ends[edge, 1 - half % 2]
+            twin = seen[other]
+            if twin >= 0:
+                graph.boundary[twin] += graph.boundary[edge]
+                graph.range_crossed[twin] += graph.range_crossed[edge]
+                graph.color_crossed[twin] += graph.color_crossed[edge]
+                graph.alive[edge] = False
+                fresh[twin] = True
+            else:
+                graph.ends[edge, half % 2] = keep
+                _append(graph, keep, half)
+                fresh[edge] = True
+        half = following
+    half = graph.first[keep]
+    while half >= 0:
+        seen[graph.ends[half // 2, 1 - half % 2]] = -1
+        half = graph.following[half]
+
+
+@kernel
+def _run(graph, moments, rule, boxes, gated, limit, work, own, merges, heights):  # type: ignore[no-untyped-def]
+    """Best-first loop. Fills merges (kept, gone) and heights; returns how many, and the number of comparisons."""
+    count = moments.energy.shape[0] - 1
+    edges = graph.ends.shape[0]
+    for k in range(1, count + 1):
+        own_residuals(moments, k, rule, work, own[k])
+    heap = np.empty((2 * edges + 16, 5))
+    size = 0
+    for edge in range(edges):
+        heap, size = _evaluate(graph, edge, moments, rule, own, boxes, gated, limit, work, heap, size)
+    comparisons = edges
+    seen = np.full(count + 1, -1, np.int64)
+    fresh = np.zeros(edges, np.bool_)
+    full_at = moments.power[:, 0, 0].copy()
+    merged = 0
+    while size > 0:
+        edge = np.int64(heap[0, 3])
+        current = graph.alive[edge] and graph.version[edge] == np.int64(heap[0, 4])
+        _pop(heap, size)
+        size -= 1
+        if not current:
+            continue
+        i = graph.ends[edge, 0]
+        j = graph.ends[edge, 1]
+        n_i = moments.power[i, 0, 0]
+        n_j = moments.power[j, 0, 0]
+        keep, gone = (i, j) if n_i > n_j or (n_i == n_j and i < j) else (j, i)
+        merges[merged, 0] = keep
+        merges[merged, 1] = gone
+        heights[merged] = graph.height[edge]
+        merged += 1
+        _join(keep, gone, moments, rule, boxes, own, work)
+        _merge_edges(graph, keep, gone, seen, fresh)
+        everything = moments.power[keep, 0, 0] >= GROWTH * full_at[keep]
+        if everything:
+            full_at[keep] = moments.power[keep, 0, 0]
+        half = graph.first[keep]
+        while half >= 0:
+            e = half // 2
+            if everything or fresh[e]:
+                heap, size = _evaluate(graph, e, moments, rule, own, boxes, gated, limit, work, heap, size)
+                comparisons += 1
+                fresh[e] = False
+            half = graph.following[half]
+    return merged, comparisons
+
+
+class Grouped(NamedTuple):
+    """What a pass of grouping did, in order: (M, 2) int64 (kept, gone), (M,) heights; comparisons made."""
+
+    merges: NDArray[np.int64]
+    heights: NDArray[np.float64]
+    comparisons: int
+
+
+def group(
+    moments: Moments, boxes: NDArray[np.int64], pairs: Pairs, rule: Rule, gated: bool, limit: float = 1.0
+) -> Grouped:
+    """Merge the best allowed pair until none is left.
+
+    Parameters
+    ----------
+    moments : sums of regions 1..N, changed in place: a kept region holds the sums of all it took in
+    boxes : (N + 1, 4) int64, and rule.degree, changed in place likewise
+    limit : pairs whose height is at most this are allowed as well; above 1 for the coarser levels of the tree
+
+    Returns
+    -------
+    Grouped
+    """
+    count = moments.energy.shape[0] - 1
+    graph = make_graph(pairs, count)
+    work: Work = make_work(moments)
+    own = np.zeros((count + 1, 2))
+    merges = np.empty((max(count, 1), 2), np.int64)
+    heights = np.empty(max(count, 1))
+    merged, comparisons = _run(
+        graph, moments, rule, boxes, gated, 0.0 if limit <= 1.0 else limit, work, own, merges, heights
+    )
+    return Grouped(merges[:merged], heights[:merged], int(comparisons))

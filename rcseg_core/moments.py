@@ -1,0 +1,224 @@
+"""Additive sufficient statistics of a region: all that eq. (12)-(14) need, without its pixels.
+
+A region keeps the power sums ``sum x^a y^b`` (a, b <= 2k: the Gram matrix R of every model up to degree k), the
+cross sums ``sum x^a y^b s`` (a, b <= k: V) and the energies ``sum s^2`` (T T^T), about a centre of its own: normal
+equations in image coordinates are unusable (condition 1e17). x and y are pixels / UNIT_PX. Sums add only about one
+centre; `shift` moves them there binomially.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rcseg_core.jit import kernel
+
+#: Coordinates are pixels divided by this, which keeps eighth powers of a VGA image near one.
+UNIT_PX = 32.0
+#: Pivots of the equilibrated Gram matrix below this are linear dependence (too few or collinear pixels).
+PIVOT_TOLERANCE = 1e-9
+
+
+class Moments(NamedTuple):
+    """Sums of N regions. Index 0 of the first axis is the background and stays zero.
+
+    center : (N, 2) float64, x then y of the local origin, px (col, row)
+    power : (N, 2k+1, 2k+1) float64; cross : (N, C, k+1, k+1) float64; energy : (N, C) float64
+    """
+
+    center: NDArray[np.float64]
+    power: NDArray[np.float64]
+    cross: NDArray[np.float64]
+    energy: NDArray[np.float64]
+
+    @property
+    def count(self) -> NDArray[np.float64]:
+        """(N,) number of pixels."""
+        return self.power[:, 0, 0]
+
+
+def plane_exponents() -> NDArray[np.int64]:
+    """Exponents (a, b) of a three-parameter plane: 1, x, y."""
+    return np.array([[0, 0], [1, 0], [0, 1]], np.int64)
+
+
+def tensor_exponents(degree: int) -> NDArray[np.int64]:
+    """Exponents (a, b) of the tensor-product polynomial of eq. (8): all a, b <= degree, a varying slowest."""
+    return np.array([[a, b] for a in range(degree + 1) for b in range(degree + 1)], np.int64)
+
+
+@kernel
+def region_boxes(labels, count):  # type: ignore[no-untyped-def]
+    """(count + 1, 4) int64 boxes row_min, col_min, row_max, col_max (inclusive) of labels 1..count."""
+    height, width = labels.shape
+    box = np.empty((count + 1, 4), np.int64)
+    box[:, 0] = height
+    box[:, 1] = width
+    box[:, 2] = -1
+    box[:, 3] = -1
+    for row in range(height):
+        for col in range(width):
+            k = labels[row, col]
+            if k > 0:
+                box[k, 0] = min(box[k, 0], row)
+                box[k, 1] = min(box[k, 1], col)
+                box[k, 2] = row
+                box[k, 3] = max(box[k, 3], col)
+    return box
+
+
+@kernel
+def _sum_runs(image, flags, labels, center, power, cross, energy):  # type: ignore[no-untyped-def]
+    """One pass over the image: each run of one label in a row is summed in x, then spread over the powers of y."""
+    height, width, channels = image.shape
+    top = power.shape[1]
+    low = cross.shape[2]
+    run_power = np.zeros(top)
+    run_cross = np.zeros((channels, low))
+    run_energy = np.zeros(channels)
+    for row in range(height):
+        col = 0
+        while col < width:
+            k = labels[row, col]
+            if k <= 0:
+                col += 1
+                continue
+            run_power[:] = 0.0
+            run_cross[:, :] = 0.0
+            run_energy[:] = 0.0
+            while col < width and labels[row, col] == k:
+                if flags[row, col] == 0:
+                    x = (col - center[k, 0]) / UNIT_PX
+                    xa = 1.0
+                    for a in range(top):
+                        run_power[a] += xa
+                        xa *= x
+                    for c in range(channels):
+                        v = np.float64(image[row, col, c])
+                        run_energy[c] += v * v
+                        for a in range(low):
+                            run_cross[c, a] += v
+                            v *= x
+                col += 1
+            y = (row - center[k, 1]) / UNIT_PX
+            for a in range(top):
+                value = run_power[a]
+                for b in range(top):
+                    power[k, a, b] += value
+                    value *= y
+            for c in range(channels):
+                energy[k, c] += run_energy[c]
+                for a in range(low):
+                    value = run_cross[c, a]
+                    for b in range(low):
+                        cross[k, c, a, b] += value
+                        value *= y
+
+
+def accumulate(
+    image: NDArray[np.float32], flags: NDArray[np.uint8], labels: NDArray[np.int32], count: int, degree: int
+) -> Moments:
+    """Moments of regions 1..count for models up to `degree`; flagged pixels count for nothing.
+
+    Parameters
+    ----------
+    image : (H, W, C) float32; flags : (H, W) uint8, non-zero leaves a pixel out; labels : (H, W) int32
+    """
+    channels = image.shape[2]
+    box = region_boxes(labels, count)
+    center = np.stack([(box[:, 1] + box[:, 3]) / 2.0, (box[:, 0] + box[:, 2]) / 2.0], 1)
+    power = np.zeros((count + 1, 2 * degree + 1, 2 * degree + 1))
+    cross = np.zeros((count + 1, channels, degree + 1, degree + 1))
+    energy = np.zeros((count + 1, channels))
+    _sum_runs(image, flags, labels, center, power, cross, energy)
+    return Moments(center, power, cross, energy)
+
+
+@kernel
+def shift_grid(grid, dx, dy, out, work):  # type: ignore[no-untyped-def]
+    """Sums of x^a y^b (weighted or not) about an origin moved by (-dx, -dy): sum (x+dx)^a (y+dy)^b.
+
+    Binomial theorem by repeated addition (x+dx)^a = (x+dx)^(a-1) x + (x+dx)^(a-1) dx, separably. work : like grid.
+    """
+    size = grid.shape[0]
+    for b in range(size):
+        for a in range(size):
+            work[a, b] = grid[a, b]
+        # after step s, work[a] holds sum x^(a-s') (x+dx)^s'; the highest power is finished first
+        for s in range(size - 1):
+            for a in range(size - 1, s, -1):
+                work[a, b] += dx * work[a - 1, b]
+    for a in range(size):
+        for b in range(size):
+            out[a, b] = work[a, b]
+        for s in range(size - 1):
+            for b in range(size - 1, s, -1):
+                out[a, b] += dy * out[a, b - 1]
+
+
+@kernel
+def solve(power, cross, first, last, exponents, gram, coef):  # type: ignore[no-untyped-def]
+    """Least-squares coefficients of channels first..last-1: A = V R^-1, eq. (13), by equilibrated Cholesky.
+
+    power : (2k+1, 2k+1); cross : (C, k+1, k+1); exponents : (p, 2); gram : (>= p + 1, >= p) work;
+    coef : (C, >= p) out. Dependent terms get the coefficient 0. Returns the rank.
+    """
+    p = exponents.shape[0]
+    scale = gram[p]
+    for i in range(p):
+        d = power[2 * exponents[i, 0], 2 * exponents[i, 1]]
+        scale[i] = 1.0 / np.sqrt(d) if d > 0.0 else 0.0
+    rank = 0
+    for i in range(p):
+        for j in range(i + 1):
+            total = power[exponents[i, 0] + exponents[j, 0], exponents[i, 1] + exponents[j, 1]]
+            total *= scale[i] * scale[j]
+            for m in range(j):
+                total -= gram[i, m] * gram[j, m]
+            if i == j:
+                if total > PIVOT_TOLERANCE:
+                    gram[i, i] = np.sqrt(total)
+                    rank += 1
+                else:
+                    gram[i, i] = 0.0
+            else:
+                gram[i, j] = total / gram[j, j] if gram[j, j] > 0.0 else 0.0
+    for c in range(first, last):
+        for i in range(p):
+            if gram[i, i] == 0.0:
+                coef[c, i] = 0.0
+                continue
+            total = cross[c, exponents[i, 0], exponents[i, 1]] * scale[i]
+            for m in range(i):
+                total -= gram[i, m] * coef[c, m]
+            coef[c, i] = total / gram[i, i]
+        for i in range(p - 1, -1, -1):
+            if gram[i, i] == 0.0:
+                continue
+            total = coef[c, i]
+            for m in range(i + 1, p):
+                total -= gram[m, i] * coef[c, m]
+            coef[c, i] = total / gram[i, i]
+        for i in range(p):
+            coef[c, i] *= scale[i]
+    return rank
+
+
+@kernel
+def residual(power, cross, energy, first, last, exponents, coef):  # type: ignore[no-untyped-def]
+    """Sum of squared residuals of any model over a region, eq. (14): tr(T T^T - 2 A V^T + A R A^T), >= 0."""
+    p = exponents.shape[0]
+    total = 0.0
+    for c in range(first, last):
+        rss = energy[c]
+        for i in range(p):
+            ai = exponents[i, 0]
+            bi = exponents[i, 1]
+            row = -2.0 * cross[c, ai, bi]
+            for j in range(p):
+                row += coef[c, j] * power[ai + exponents[j, 0], bi + exponents[j, 1]]
+            rss += coef[c, i] * row
+        total += max(rss, 0.0)
+    return total

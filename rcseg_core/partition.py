@@ -1,0 +1,91 @@
+"""The partition while it is being built: label image, leaf image and merge tree, kept in step.
+
+`labels` are the current regions 1..count; `leaves` the seeds that every pixel came with. The tree links the two.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rcseg_core.grouping import Grouped
+from rcseg_core.hierarchy import TreeBuilder
+
+
+class Partition:
+    """Regions 1..count over the pixels (0 unassigned) and the tree that led to them."""
+
+    def __init__(self, seeds: NDArray[np.int32], count: int) -> None:
+        self.labels = seeds
+        self.leaves = seeds.copy()
+        self.count = count
+        self.tree = TreeBuilder(count)
+        #: (count + 1,) tree node of each current region
+        self.nodes = np.arange(count + 1)
+
+    def apply(self, grouped: Grouped) -> NDArray[np.int64]:
+        """Carry out the merges: relabel and record them. Returns the old label of each new region, (count + 1,)."""
+        target = np.arange(self.count + 1)
+        for (keep, gone), height in zip(grouped.merges, grouped.heights):
+            self.nodes[keep] = self.tree.merge(int(self.nodes[keep]), int(self.nodes[gone]), float(height))
+            target[gone] = keep
+        for k in range(len(grouped.merges) - 1, -1, -1):  # later merges first, so that every chain is followed
+            keep, gone = grouped.merges[k]
+            target[gone] = target[keep]
+        alive = np.unique(target)  # 0 stays 0
+        new = np.zeros(self.count + 1, np.int32)
+        new[alive] = np.arange(alive.size)
+        self._relabel(new[target], alive)
+        return alive
+
+    def _relabel(self, mapping: NDArray[np.int32], alive: NDArray[np.int64]) -> None:
+        self.labels = mapping[self.labels]
+        self.nodes = self.nodes[alive]
+        self.count = alive.size - 1
+
+    def add_leftovers(self, candidates: NDArray[np.bool_], least: int) -> int:
+        """Connected unassigned pixels become regions where at least `least` hang together; returns how many did."""
+        rest = (candidates & (self.labels == 0)).astype(np.uint8)
+        if not rest.any():
+            return 0
+        found, parts, stats, _ = cv2.connectedComponentsWithStats(rest, connectivity=4)
+        large = stats[:, cv2.CC_STAT_AREA] >= least
+        large[0] = False
+        extra = int(large.sum())
+        if extra == 0:
+            return 0
+        number = np.zeros(found, np.int32)
+        number[large] = np.arange(1, extra + 1)
+        part = number[parts]
+        new = part > 0
+        self.labels[new] = part[new] + self.count
+        old_leaves = self.tree.leaf_count
+        self.leaves[new] = part[new] + old_leaves
+        self.tree.add_leaves(extra)
+        inner = self.nodes > old_leaves
+        self.nodes[inner] += extra
+        self.nodes = np.concatenate([self.nodes, np.arange(old_leaves + 1, old_leaves + extra + 1)])
+        self.count += extra
+        return extra
+
+    def drop_small(self, least: int) -> None:
+        """Free the pixels of regions under `least` pixels, so that they can join a neighbour."""
+        sizes = np.bincount(self.labels.ravel(), minlength=self.count + 1)
+        keep = sizes >= least
+        keep[0] = True
+        self.remove(keep)
+
+    def remove(self, keep: NDArray[np.bool_]) -> None:
+        """Keep only the regions marked (index 0 must be), renumbered without gaps; their pixels become 0."""
+        mapping = np.where(keep, np.cumsum(keep) - 1, 0).astype(np.int32)
+        self._relabel(mapping, np.nonzero(keep)[0])
+
+    def sort_by_size(self) -> None:
+        """Number the regions from the largest down (ties by the first pixel), without gaps."""
+        sizes = np.bincount(self.labels.ravel(), minlength=self.count + 1)
+        order = np.argsort(-sizes[1:], kind="stable") + 1
+        order = order[sizes[order] > 0]
+        mapping = np.zeros(self.count + 1, np.int32)
+        mapping[order] = np.arange(1, order.size + 1)
+        self._relabel(mapping, np.concatenate([[0], order]))

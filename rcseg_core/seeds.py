@@ -1,0 +1,301 @@
+"""Step 2: the initial partition, windows of 11 to 3 pixels with a least-median-of-squares fit (section 5).
+
+For each window size, largest first: every window without edge and without assigned pixel gets a first-order model
+of range and colour; outliers of the fit are released for other regions. A window whose plain least-squares
+residual is already pure noise needs no robust search (``fit = "auto"``); the others get 72 random planes, judged
+by the median of the joint Mahalanobis residual, whose scale in d dimensions is med/chi2_{d,0.5} with the cut at
+chi2_{d,0.975}.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from rcseg_core.config import SeedsConfig
+from rcseg_core.jit import kernel
+from rcseg_core.signals import Signals, local_scales
+
+#: A seed must keep this share of its usable pixels as inliers (LMS breaks down at half).
+MIN_INLIERS = 0.5
+#: The residual variance of a window may exceed the noise by this factor, besides the tolerance.
+NOISE_FACTOR = 2.0
+
+
+@kernel
+def _random(state):  # type: ignore[no-untyped-def]
+    """xorshift64*: a frame must give the same seeds on every run and with every number of threads."""
+    state ^= state >> np.uint64(12)
+    state ^= state << np.uint64(25)
+    state ^= state >> np.uint64(27)
+    return state
+
+
+@kernel
+def fit_plane(samples, use, count, coef):  # type: ignore[no-untyped-def]
+    """Least-squares planes through the used samples of a window.
+
+    samples : (m, 2 + C) float64, columns x, y, then the channels; use : (m,) bool; coef : (C, 3) float64 out, the
+    value at the window centre and the slopes. Returns False where the samples do not span a plane.
+    """
+    channels = samples.shape[1] - 2
+    s0 = sx = sy = sxx = sxy = syy = 0.0
+    for i in range(count):
+        if use[i]:
+            x = samples[i, 0]
+            y = samples[i, 1]
+            s0 += 1.0
+            sx += x
+            sy += y
+            sxx += x * x
+            sxy += x * y
+            syy += y * y
+    if s0 < 3.0:
+        return False
+    mx = sx / s0
+    my = sy / s0
+    axx = sxx - sx * mx
+    axy = sxy - sx * my
+    ayy = syy - sy * my
+    det = axx * ayy - axy * axy
+    if det < 1e-9 * (axx + ayy) * (axx + ayy) or det <= 0.0:
+        return False
+    for c in range(channels):
+        v0 = vx = vy = 0.0
+        for i in range(count):
+            if use[i]:
+                v = samples[i, 2 + c]
+                v0 += v
+                vx += (samples[i, 0] - mx) * v
+                vy += (samples[i, 1] - my) * v
+        gx = (ayy * vx - axy * vy) / det
+        gy = (axx * vy - axy * vx) / det
+        coef[c, 1] = gx
+        coef[c, 2] = gy
+        coef[c, 0] = v0 / s0 - gx * mx - gy * my
+    return True
+
+
+@kernel
+def joint_residuals(samples, count, coef, n_range, weight_r, weight_c, out):  # type: ignore[no-untyped-def]
+    """Squared Mahalanobis residual of each sample, range and colour together."""
+    channels = samples.shape[1] - 2
+    for i in range(count):
+        x = samples[i, 0]
+        y = samples[i, 1]
+        total_r = 0.0
+        total_c = 0.0
+        for c in range(channels):
+            d = samples[i, 2 + c] - coef[c, 0] - coef[c, 1] * x - coef[c, 2] * y
+            if c < n_range:
+                total_r += d * d
+            else:
+                total_c += d * d
+        out[i] = total_r * weight_r + total_c * weight_c
+
+
+@kernel
+def _minimal_plane(samples, a, b, c, coef):  # type: ignore[no-untyped-def]
+    """The plane through three samples; False where they are nearly collinear."""
+    ux = samples[b, 0] - samples[a, 0]
+    uy = samples[b, 1] - samples[a, 1]
+    vx = samples[c, 0] - samples[a, 0]
+    vy = samples[c, 1] - samples[a, 1]
+    det = ux * vy - uy * vx
+    if abs(det) < 2.0:
+        return False
+    for k in range(samples.shape[1] - 2):
+        du = samples[b, 2 + k] - samples[a, 2 + k]
+        dv = samples[c, 2 + k] - samples[a, 2 + k]
+        gx = (vy * du - uy * dv) / det
+        gy = (ux * dv - vx * du) / det
+        coef[k, 1] = gx
+        coef[k, 2] = gy
+        coef[k, 0] = samples[a, 2 + k] - gx * samples[a, 0] - gy * samples[a, 1]
+    return True
+
+
+@kernel
+def lms_inliers(samples, count, n_range, w_r, w_c, half, cut, subsets, state, coef, trial, res, use):  # type: ignore[no-untyped-def]
+    """Least median of squares: mark the inliers of the best of `subsets` random minimal planes in `use`.
+
+    half, cut : chi2_{d,0.5} and chi2_{d,0.975} for the joint dimension d. Returns the number of inliers.
+    """
+    best = np.inf
+    middle = count // 2
+    for _ in range(subsets):
+        state = _random(state)
+        a = np.int64(state % np.uint64(count))
+        state = _random(state)
+        b = np.int64(state % np.uint64(count))
+        state = _random(state)
+        c = np.int64(state % np.uint64(count))
+        if not _minimal_plane(samples, a, b, c, trial):
+            continue
+        joint_residuals(samples, count, trial, n_range, w_r, w_c, res)
+        # only a median below the best so far is worth sorting for
+        below = 0
+        for i in range(count):
+            if res[i] < best:
+                below += 1
+        if below <= middle:
+            continue
+        best = np.partition(res[:count], middle)[middle]
+        coef[:, :] = trial
+    if best == np.inf:
+        return 0
+    # the sensor's sigma is the floor: quantised depth can give a zero median
+    scale2 = max(1.0, best / half)
+    joint_residuals(samples, count, coef, n_range, w_r, w_c, res)
+    inliers = 0
+    for i in range(count):
+        use[i] = res[i] <= cut * scale2
+        inliers += use[i]
+    return inliers
+
+
+@kernel
+def _fits(samples, use, count, coef, n_range, var, eps2_r, eps2_c):  # type: ignore[no-untyped-def]
+    """Whether range and colour residuals of the used samples are noise (within NOISE_FACTOR) plus tolerance."""
+    channels = samples.shape[1] - 2
+    n = 0
+    rss_r = 0.0
+    rss_c = 0.0
+    for i in range(count):
+        if not use[i]:
+            continue
+        n += 1
+        for c in range(channels):
+            d = samples[i, 2 + c] - coef[c, 0] - coef[c, 1] * samples[i, 0] - coef[c, 2] * samples[i, 1]
+            if c < n_range:
+                rss_r += d * d
+            else:
+                rss_c += d * d
+    dof = max(n - 3, 1)
+    slack = NOISE_FACTOR + 4.0 / np.sqrt(dof)
+    good_r = rss_r <= dof * n_range * slack * var + n * eps2_r
+    good_c = rss_c <= dof * (channels - n_range) * slack + n * eps2_c
+    return good_r and good_c
+
+
+@kernel
+def _try_window(image, flags, row0, col0, size, n_range, law, eps2_c, half, cut, robust, subsets, min_valid, work, labels, label):  # type: ignore[no-untyped-def]
+    """Fit one free window; write its inliers as `label`. Returns the number of pixels, 0 if it is no seed."""
+    samples, coef, trial, res, use = work
+    channels = image.shape[2]
+    center = size // 2
+    count = 0
+    for i in range(size):
+        for j in range(size):
+            if flags[row0 + i, col0 + j] != 0:
+                continue
+            samples[count, 0] = j - center
+            samples[count, 1] = i - center
+            for c in range(channels):
+                samples[count, 2 + c] = image[row0 + i, col0 + j, c]
+            use[count] = True
+            count += 1
+    if count < min_valid * size * size or count < 5:
+        return 0
+    if not fit_plane(samples, use, count, coef):
+        return 0
+    var, eps2_r = local_scales(law, coef[0, 0])
+    # half of the tolerance, as for single pixels: a seed is held to more than a grown region
+    if robust or not _fits(samples, use, count, coef, n_range, var, 0.25 * eps2_r, 0.25 * eps2_c):
+        w_r = 1.0 / (var + 0.25 * eps2_r / n_range)
+        w_c = 1.0 / (1.0 + 0.25 * eps2_c / 3.0)
+        state = np.uint64(88172645463325252) ^ np.uint64((row0 * 65536 + col0) * 64 + size)
+        inliers = lms_inliers(
+            samples, count, n_range, w_r, w_c, half, cut, subsets, state, coef, trial, res, use
+        )
+        if inliers < MIN_INLIERS * count or inliers < 5:
+            return 0
+        if not fit_plane(samples, use, count, coef):
+            return 0
+        var, eps2_r = local_scales(law, coef[0, 0])
+        if not _fits(samples, use, count, coef, n_range, var, 0.25 * eps2_r, 0.25 * eps2_c):
+            return 0
+    index = 0
+    taken = 0
+    for i in range(size):
+        for j in range(size):
+            if flags[row0 + i, col0 + j] != 0:
+                continue
+            if use[index]:
+                labels[row0 + i, col0 + j] = label
+                taken += 1
+            index += 1
+    return taken
+
+
+@kernel
+def place_windows(image, flags, edges, n_range, law, eps2_c, sizes, half, cut, robust, subsets, min_valid, labels):  # type: ignore[no-untyped-def]
+    """Fill `labels` (H, W) int32 with seeds 1..N; returns N. Windows in raster order, sizes largest first.
+
+    A window is free when the last `size` columns each have a run of `size` rows without edge or seed above them.
+    """
+    height, width, channels = image.shape
+    most = sizes[0] * sizes[0]
+    work = (
+        np.empty((most, 2 + channels)),
+        np.empty((channels, 3)),
+        np.empty((channels, 3)),
+        np.empty(most),
+        np.empty(most, np.bool_),
+    )
+    count = 0
+    run = np.empty(width, np.int64)
+    for size in sizes:
+        run[:] = 0
+        for row in range(height):
+            streak = 0
+            for col in range(width):
+                free = edges[row, col] == 0 and labels[row, col] == 0
+                run[col] = run[col] + 1 if free else 0
+                streak = streak + 1 if run[col] >= size else 0
+                if streak < size:
+                    continue
+                row0 = row - size + 1
+                col0 = col - size + 1
+                taken = _try_window(
+                    image, flags, row0, col0, size, n_range, law, eps2_c, half, cut, robust, subsets,
+                    min_valid, work, labels, count + 1,
+                )  # fmt: skip
+                if taken > 0:
+                    count += 1
+                    for c in range(col0, col + 1):
+                        run[c] = 0
+                    streak = 0
+                else:
+                    # a window that failed tells of its neighbours: step by half a window, in rows as well
+                    streak = size // 2
+                    for c in range(col0, col0 + size - size // 2):
+                        run[c] = size // 2
+    return count
+
+
+def initial_partition(
+    signals: Signals, edges: NDArray[np.uint8], config: SeedsConfig
+) -> tuple[NDArray[np.int32], int]:
+    """The initial partition.
+
+    Parameters
+    ----------
+    edges : (H, W) uint8, non-zero where no window may lie
+
+    Returns
+    -------
+    labels : (H, W) int32, 0 unassigned, 1..count seeds
+    count : int
+    """
+    labels = np.zeros(signals.flags.shape, np.int32)
+    top = min(config.max_window, *(s - 1 + s % 2 for s in labels.shape))
+    sizes = np.arange(top, min(config.min_window, top) - 1, -2, dtype=np.int64)
+    dims = 1 + 3 if signals.inverse_depth else signals.image.shape[2]
+    count = place_windows(
+        signals.image, signals.flags, edges, signals.n_range, signals.law, signals.color_eps2, sizes,
+        float(chi2.ppf(0.5, dims)), float(chi2.ppf(0.975, dims)), config.fit == "lms", config.subsets,
+        config.min_valid, labels,
+    )  # fmt: skip
+    return labels, int(count)

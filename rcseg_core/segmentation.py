@@ -1,0 +1,146 @@
+"""The result: label images, regions with their Bezier patches, the merge tree, and the image they stand for."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rcseg_core.bezier import BezierPatch
+from rcseg_core.frame import PinholeCamera
+from rcseg_core.hierarchy import Hierarchy
+from rcseg_core.models import Models, render
+from rcseg_core.signals import Signals
+
+
+@dataclass(frozen=True)
+class Region:
+    """One region of the partition.
+
+    Attributes
+    ----------
+    label : value in `Segmentation.labels`
+    surface : value in `Segmentation.surface_labels`
+    pixel_count : assigned pixels
+    box : (row_min, col_min, row_max, col_max), inclusive
+    centroid : (3,) float64, mean of the measured points, m; NaN without any
+    normal : (3,) float64, unit normal of the range patch at the middle of the region, towards the sensor
+    neighbors : labels of the regions that touch this one, ascending
+    range_patch, color_patch : BezierPatch
+    """
+
+    label: int
+    surface: int
+    pixel_count: int
+    box: tuple[int, int, int, int]
+    centroid: NDArray[np.float64]
+    normal: NDArray[np.float64]
+    neighbors: tuple[int, ...]
+    range_patch: BezierPatch
+    color_patch: BezierPatch
+
+
+@dataclass(frozen=True)
+class Segmentation:
+    """What `segment` returns.
+
+    Attributes
+    ----------
+    labels : (H, W) int32; 0 unlabelled, 1..N regions of one surface and one colour model, largest first
+    surface_labels : (H, W) int32; 0 unlabelled, 1..M continuous surfaces, unions of regions
+    regions : sequence of Region, ``regions[i].label == i + 1``
+    hierarchy : merge tree over the initial partition
+    edges : (H, W) uint8 bit mask: depth 1, orientation 2, colour 4
+    noise : the NoiseModel that was used
+    timings : seconds by stage, in order
+    camera : PinholeCamera or None, that of the frame
+    """
+
+    labels: NDArray[np.int32]
+    surface_labels: NDArray[np.int32]
+    regions: Sequence[Region]
+    hierarchy: Hierarchy
+    edges: NDArray[np.uint8]
+    timings: dict[str, float]
+    camera: PinholeCamera | None
+    signals: Signals = field(repr=False)
+    models: Models = field(repr=False)
+    leaves: NDArray[np.int32] = field(repr=False)
+    nodes: NDArray[np.int64] = field(repr=False)
+    coarsen: Callable[[float], NDArray[np.int64]] = field(repr=False)
+
+    @property
+    def noise(self):  # type: ignore[no-untyped-def]
+        """The NoiseModel of this frame."""
+        return self.signals.noise
+
+    def labels_at(self, level: float) -> NDArray[np.int32]:
+        """The partition at another approximation limit, without segmenting again.
+
+        Parameters
+        ----------
+        level : float >= 0
+            Multiple of the configured tolerances: 1 is the result itself, 0 joins only what noise explains, 2
+            allows twice the tolerance. Each step up only joins regions.
+
+        Returns
+        -------
+        (H, W) int32, 0 unlabelled, numbered from the largest region down.
+
+        Raises
+        ------
+        ValueError
+            For a negative or NaN level.
+        """
+        if not level >= 0:
+            raise ValueError(f"level = {level}: expected a multiple of the tolerance, 0 or more (1 is the result)")
+        if level == 1:
+            return self.labels.copy()
+        if level > 1:
+            groups = self.coarsen(float(level))[self.labels]
+        else:
+            groups = self.hierarchy.cut(level)[self.leaves]
+        groups[self.labels == 0] = 0
+        return compact(groups)
+
+    @cached_property
+    def _rendered(self) -> NDArray[np.float32]:
+        return render(self.models, self.labels, self.signals.image.shape[2], self.signals.n_range)
+
+    def reconstruct(self) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+        """Range and colour from the parameters alone (eq. 1-2).
+
+        Returns
+        -------
+        points : (H, W, 3) float32, m; NaN where unlabelled or behind the camera
+        color : (H, W, 3) uint8; 0 where unlabelled
+        """
+        signals = self.signals
+        n = signals.n_range
+        scale, offset = signals.scale.astype(np.float32), signals.offset.astype(np.float32)
+        values = self._rendered
+        color = np.clip(np.rint(values[..., n:] * scale[n:] + offset[n:]), 0, 255).astype(np.uint8)
+        unlabelled = self.labels == 0
+        color[unlabelled] = 0
+        points = values[..., :n] * scale[:n] + offset[:n]
+        if signals.inverse_depth:
+            assert self.camera is not None
+            inverse = np.where(points[..., 0] > 0, points[..., 0], np.nan)
+            points = self.camera.rays(*self.labels.shape) / inverse[..., None]
+        points[unlabelled] = np.nan
+        return points.astype(np.float32), color
+
+
+def compact(groups: NDArray[np.integer]) -> NDArray[np.int32]:
+    """Number the positive values of an image 1..n from the most frequent down (ties by value)."""
+    values, inverse, counts = np.unique(groups, return_inverse=True, return_counts=True)
+    counts = np.where(values > 0, counts, np.iinfo(np.int64).max)  # 0 first
+    order = np.argsort(-counts, kind="stable")
+    number = np.empty(values.size, np.int32)
+    shift = 0 if values.size and values[0] == 0 else 1
+    number[order] = np.arange(values.size) + shift
+    return number[inverse].reshape(groups.shape)

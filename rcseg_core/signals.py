@@ -1,0 +1,181 @@
+"""The two signals of section 2, whitened: one (H, W, C) image in which every residual counts in sigmas.
+
+Range first (inverse depth, or x, y, z), colour after. Division by the noise once, here, is Sigma^-1 of eq. (3):
+all later sums of squares are chi-squared. The range noise may depend on the signal, and the tolerance is a share
+of depth, so both stay a small law of the (whitened) signal, evaluated once a region.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rcseg_core.cleaning import color_median, local_median
+from rcseg_core.config import SegmenterConfig
+from rcseg_core.errors import ConfigError
+from rcseg_core.frame import RangeColorFrame
+from rcseg_core.jit import kernel
+from rcseg_core.noise import NoiseModel, estimate_noise
+
+# Flags of a pixel, a bit mask in `Signals.flags`.
+INVALID, RANGE_OUTLIER, COLOR_OUTLIER = 1, 2, 4
+
+
+@dataclass(frozen=True)
+class Signals:
+    """Whitened signals of one frame and what is needed to turn them back.
+
+    Attributes
+    ----------
+    image : (H, W, C) float32, C = Cr + 3; channel c is (signal - offset[c]) / scale[c]; 0 where invalid
+    cleaned : (H, W, C) float32, image with invalid pixels and impulses replaced by the local median
+    flags : (H, W) uint8 bit mask: 1 invalid, 2 range impulse, 4 colour impulse
+    n_range : Cr, 1 for inverse depth, 3 for x, y, z
+    scale, offset : (C,) float64
+    law : (6,) float64, `local_scales` reads it: variance of the whitened range noise and squared tolerances
+    color_eps2 : squared colour tolerance (a distance in RGB) in sigma^2
+    noise : NoiseModel
+    inverse_depth : bool
+    """
+
+    image: NDArray[np.float32]
+    cleaned: NDArray[np.float32]
+    flags: NDArray[np.uint8]
+    n_range: int
+    scale: NDArray[np.float64]
+    offset: NDArray[np.float64]
+    law: NDArray[np.float64]
+    color_eps2: float
+    noise: NoiseModel
+    inverse_depth: bool
+
+
+@kernel
+def local_scales(law, value):  # type: ignore[no-untyped-def]
+    """Variance of the range noise and squared range tolerance, both in sigma^2, at a whitened signal value."""
+    sigma = law[0] + value * (law[1] + value * law[2])
+    if sigma < 0.2:
+        sigma = 0.2
+    eps = law[3] + law[4] * value
+    return sigma * sigma, eps * eps
+
+
+def uses_inverse_depth(frame: RangeColorFrame, config: SegmenterConfig) -> bool:
+    """Which range signal is modelled; a camera is needed for inverse depth."""
+    if config.signal.kind == "inverse_depth" and frame.camera is None:
+        raise ConfigError("signal.kind = inverse_depth needs a camera model; this frame has none")
+    return frame.camera is not None and config.signal.kind != "xyz"
+
+
+def build_signals(
+    frame: RangeColorFrame, color: NDArray[np.uint8], config: SegmenterConfig
+) -> Signals:
+    """Measure the noise, flag impulses and whiten.
+
+    Parameters
+    ----------
+    color : (H, W, 3) uint8, after the reflectance stage
+    """
+    valid = frame.valid
+    inverse = uses_inverse_depth(frame, config)
+    raw = _range_signal(frame, inverse)
+    median_r = local_median(raw, valid)
+    median_c = color_median(color)
+    noise = estimate_noise(raw, median_r, valid, color, median_c, inverse, config.noise)
+
+    n_range = raw.shape[2]
+    typical = np.median(raw[valid], axis=0).astype(np.float64)
+    scale = np.concatenate([_typical_sigma(noise, typical), noise.color])
+    offset = np.concatenate([typical, np.full(3, 127.0)])
+    law = _law(noise, scale[0], typical, inverse, frame, config.grouping.range_tolerance)
+    eps_c = config.grouping.color_tolerance / noise.color
+
+    image = _whiten(raw, color, scale, offset)
+    median = _whiten(median_r, median_c, scale, offset)
+    flags = np.where(valid, 0, INVALID).astype(np.uint8)
+    flag_outliers(image, median, law, n_range, config.edges.outlier_threshold, flags)
+    replace = flags & (INVALID | RANGE_OUTLIER) != 0
+    cleaned = image.copy()
+    cleaned[replace, :n_range] = median[replace, :n_range]
+    replace = flags & COLOR_OUTLIER != 0
+    cleaned[replace, n_range:] = median[replace, n_range:]
+    image[~valid, :n_range] = 0
+    return Signals(
+        image, cleaned, flags, n_range, scale, offset, law, float(np.sum(eps_c**2)) / 3.0, noise, inverse
+    )
+
+
+@kernel
+def flag_outliers(image, median, law, n_range, threshold, flags):  # type: ignore[no-untyped-def]
+    """Mark pixels further than `threshold` sigmas from the local median, range and colour apart."""
+    if threshold <= 0.0:
+        return
+    height, width, channels = image.shape
+    for row in range(height):
+        for col in range(width):
+            if flags[row, col] & INVALID == 0:
+                var, _ = local_scales(law, median[row, col, 0])
+                far = 0.0
+                for c in range(n_range):
+                    d = image[row, col, c] - median[row, col, c]
+                    far = max(far, d * d)
+                if far > threshold * threshold * var:
+                    flags[row, col] |= RANGE_OUTLIER
+            far = 0.0
+            for c in range(n_range, channels):
+                d = image[row, col, c] - median[row, col, c]
+                far = max(far, d * d)
+            if far > threshold * threshold:
+                flags[row, col] |= COLOR_OUTLIER
+
+
+def _range_signal(frame: RangeColorFrame, inverse: bool) -> NDArray[np.float32]:
+    if not inverse:
+        return np.where(frame.valid[..., None], frame.points, 0).astype(np.float32)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inv = 1.0 / frame.depth_m
+    return np.where(frame.valid, inv, 0).astype(np.float32)[..., None]
+
+
+def _typical_sigma(noise: NoiseModel, typical: NDArray[np.float64]) -> NDArray[np.float64]:
+    if noise.range_law.shape[0] == 1:
+        return np.atleast_1d(noise.range_sigma(typical[0]))
+    return noise.range_law[:, 0]
+
+
+def _law(
+    noise: NoiseModel,
+    scale: float,
+    typical: NDArray[np.float64],
+    inverse: bool,
+    frame: RangeColorFrame,
+    tolerance: float,
+) -> NDArray[np.float64]:
+    """Coefficients for `local_scales`: sigma and tolerance as polynomials of the whitened first channel."""
+    if inverse:
+        a, b, c = noise.range_law[0]
+        t = typical[0]  # s = t + scale v
+        sigma = (a + b * t + c * t * t, (b + 2 * c * t) * scale, c * scale * scale)
+        # dz = tolerance z is dw = tolerance w
+        return np.array([s / scale for s in sigma] + [tolerance * t / scale, tolerance])
+    low, high = np.quantile(frame.points[frame.valid].astype(np.float64), [0.02, 0.98], axis=0)
+    extent = float(np.linalg.norm(high - low))
+    sigma_m = float(np.sqrt(np.mean(noise.range_law[:, 0] ** 2)))
+    return np.array([1.0, 0.0, 0.0, tolerance * extent / sigma_m, 0.0])
+
+
+def _whiten(
+    range_signal: NDArray[np.float32],
+    color: NDArray[np.uint8],
+    scale: NDArray[np.float64],
+    offset: NDArray[np.float64],
+) -> NDArray[np.float32]:
+    n_range = range_signal.shape[2]
+    out = np.empty((*range_signal.shape[:2], n_range + 3), np.float32)
+    gain = (1.0 / scale).astype(np.float32)
+    base = offset.astype(np.float32)
+    np.multiply(range_signal - base[:n_range], gain[:n_range], out=out[..., :n_range])
+    np.multiply(color - base[n_range:], gain[n_range:], out=out[..., n_range:])
+    return out

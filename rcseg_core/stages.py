@@ -1,0 +1,142 @@
+"""Composition of the kernels into the passes of the algorithm: measure, generalise, group, for one degree at a time."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rcseg_core.adjacency import Pairs, find_pairs
+from rcseg_core.config import SegmenterConfig
+from rcseg_core.evidence import KINDS, Rule
+from rcseg_core.generalization import choose_degrees
+from rcseg_core.grouping import group
+from rcseg_core.models import Models, fit_models
+from rcseg_core.moments import Moments, accumulate, plane_exponents, region_boxes, tensor_exponents
+from rcseg_core.partition import Partition
+from rcseg_core.signals import Signals, local_scales
+
+
+def measure(
+    partition: Partition, edges: NDArray[np.uint8], config: SegmenterConfig
+) -> tuple[NDArray[np.int64], Pairs]:
+    """Boxes and adjacent pairs of the current regions."""
+    boxes = region_boxes(partition.labels, partition.count)
+    pairs = find_pairs(partition.labels, partition.count, edges, config.grouping.max_gap)
+    return boxes, pairs
+
+
+def make_rule(
+    signals: Signals, degree: NDArray[np.int64], config: SegmenterConfig, *, planes: bool, use_color: bool = True
+) -> Rule:
+    """The comparison of a pass; `planes`: first-degree models have three terms instead of four."""
+    first = plane_exponents() if planes else tensor_exponents(1)
+    terms = (tensor_exponents(0), first, tensor_exponents(2), tensor_exponents(3), tensor_exponents(4))
+    return Rule(
+        KINDS[config.grouping.criterion],
+        signals.n_range,
+        signals.image.shape[2],
+        signals.law,
+        signals.color_eps2,
+        config.grouping.noise_share**2,
+        config.grouping.prior_beta**2,
+        True,
+        use_color,
+        terms,
+        degree,
+    )
+
+
+def noise_variance(moments: Moments, signals: Signals) -> NDArray[np.float64]:
+    """(N + 1, 2) variance of one pixel's noise in whitened units at the mean signal of each region."""
+    count = np.maximum(moments.count, 1.0)
+    mean = moments.cross[:, 0, 0, 0] / count
+    out = np.ones((count.size, 2))
+    for k in range(1, count.size):
+        out[k, 0] = local_scales(signals.law, mean[k])[0]
+    return out
+
+
+def pass_degrees(
+    moments: Moments, signals: Signals, degree: int, config: SegmenterConfig
+) -> NDArray[np.int64]:
+    """Degrees with which the regions enter a pass: all at `degree` (pair), or each as its own tests say (region)."""
+    general = config.generalization
+    start = np.ones((moments.energy.shape[0], 2), np.int64)
+    if general.hypothesis == "pair":
+        start[:, 0] = min(degree, general.max_range_degree)
+        start[:, 1] = min(degree, general.max_color_degree)
+        return start
+    variance = noise_variance(moments, signals)
+    return choose_degrees(moments, signals.n_range, start, variance, general, highest=degree)
+
+
+def group_pass(
+    partition: Partition, signals: Signals, edges: NDArray[np.uint8], degree: int, config: SegmenterConfig
+) -> Models:
+    """Steps 3-6 at one degree: generalise, then group until the best pair exceeds the limit. Returns the models."""
+    boxes, pairs = measure(partition, edges, config)
+    moments = accumulate(signals.image, signals.flags, partition.labels, partition.count, degree)
+    planes = degree == 1 and config.generalization.hypothesis == "pair"
+    rule = make_rule(signals, pass_degrees(moments, signals, degree, config), config, planes=planes)
+    grouped = group(moments, boxes, pairs, rule, config.grouping.edge_gate)
+    alive = partition.apply(grouped)
+    kept = Moments(*(a[alive] for a in moments))
+    return fit_models(kept, rule.degree[alive], signals.n_range, planes)
+
+
+def final_degrees(
+    partition: Partition, signals: Signals, config: SegmenterConfig
+) -> tuple[Moments, NDArray[np.int64]]:
+    """Moments up to the highest degree and the least degrees that the tests of section 7 support."""
+    general = config.generalization
+    top = max(general.max_range_degree, general.max_color_degree)
+    moments = accumulate(signals.image, signals.flags, partition.labels, partition.count, top)
+    start = np.ones((partition.count + 1, 2), np.int64)
+    return moments, choose_degrees(
+        moments, signals.n_range, start, noise_variance(moments, signals), general, highest=top
+    )
+
+
+def _groups(grouped_count: int, merges: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(N + 1,) lowest label of the group of each region."""
+    parent = np.arange(grouped_count + 1)
+    for keep, gone in merges:
+        parent[gone] = keep
+    for k in range(1, grouped_count + 1):
+        root = k
+        while parent[root] != root:
+            root = parent[root]
+        parent[k] = root
+    lowest = np.full(grouped_count + 1, grouped_count + 1)
+    np.minimum.at(lowest, parent, np.arange(grouped_count + 1))
+    return lowest[parent]
+
+
+def _copy(moments: Moments) -> Moments:
+    return Moments(*(a.copy() for a in moments))
+
+
+def surfaces_of(
+    partition: Partition, signals: Signals, moments: Moments, boxes: NDArray[np.int64], pairs: Pairs,
+    config: SegmenterConfig,
+) -> NDArray[np.int64]:  # fmt: skip
+    """(N + 1,) surface of each region, 1..M: regions that one range model explains, whatever their colour."""
+    degree = np.full((partition.count + 1, 2), config.generalization.max_range_degree, np.int64)
+    rule = make_rule(signals, degree, config, planes=False, use_color=False)
+    grouped = group(_copy(moments), boxes.copy(), pairs, rule, config.grouping.edge_gate)
+    lowest = _groups(partition.count, grouped.merges)
+    numbers = np.unique(lowest, return_inverse=True)[1]
+    return numbers.astype(np.int64)
+
+
+def coarser_groups(
+    signals: Signals, moments: Moments, boxes: NDArray[np.int64], pairs: Pairs, config: SegmenterConfig,
+    level: float,
+) -> NDArray[np.int64]:  # fmt: skip
+    """(N + 1,) group of each region when the approximation limit is `level` times as wide."""
+    count = moments.energy.shape[0] - 1
+    degree = np.full((count + 1, 2), config.generalization.max_range_degree, np.int64)
+    degree[:, 1] = config.generalization.max_color_degree
+    rule = make_rule(signals, degree, config, planes=False)
+    grouped = group(_copy(moments), boxes.copy(), pairs, rule, config.grouping.edge_gate, limit=level)
+    return _groups(count, grouped.merges)
