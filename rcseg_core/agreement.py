@@ -1,7 +1,7 @@
 """Measures of agreement between two partitions of an image, computed from their contingency table.
 
-Information, pair counting, overlap, parts and borders; `evaluation` says what each is for and under which conventions
-they are applied.
+Information, pair counting, overlap, parts and borders; `evaluation` says what each is for and under which
+conventions they are applied.
 """
 
 from __future__ import annotations
@@ -41,13 +41,13 @@ def rand_indices(counts: NDArray[np.int64]) -> tuple[float, float]:
 
 def _pairs(counts: NDArray[np.int64]) -> NDArray[np.float64]:
     values = counts.astype(float)
-    return values * (values - 1) / 2
+    return np.asarray(values * (values - 1) / 2)
 
 
 def intersection_over_union(table: Contingency) -> NDArray[np.float64]:
-    """(N, M)"""
+    """(N, M): IoU of every truth region with every machine region."""
     union = table.truth_sizes[:, None] + table.machine_sizes[None, :] - table.overlap
-    return table.overlap / np.maximum(union, 1)
+    return np.asarray(table.overlap / np.maximum(union, 1))
 
 
 def covering(table: Contingency) -> float:
@@ -64,8 +64,7 @@ def coverage(table: Contingency) -> float:
 
 
 def count_parts(table: Contingency, crumb_px: float) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Raw and weighted number of parts of each truth region (N,); `PartMetrics.parts_per_object` has the
-    rule."""
+    """Raw and weighted number of parts of each truth region (N,), by the rule in `PartMetrics`."""
     scale = np.maximum(crumb_px, 0.01 * table.truth_sizes)
     unlabelled = table.counts[1:, 0] / scale
     raw = np.zeros(len(table.truth_ids), np.int64)

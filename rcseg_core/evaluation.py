@@ -16,7 +16,6 @@ milliseconds. Three conventions hold everywhere:
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -25,14 +24,14 @@ from numpy.typing import NDArray
 from rcseg_core import agreement
 from rcseg_core.datasets import REGIONS
 from rcseg_core.errors import InputError
-from rcseg_core.hoover import TOLERANCES, HooverResult, contingency, sweep
+from rcseg_core.hoover import TOLERANCES, contingency, sweep
+from rcseg_core.metrics import LabelMetrics, PartMetrics, ReconstructionMetrics, SceneMetrics
 
 if TYPE_CHECKING:
     from rcseg_core.datasets import LabelledFrame
     from rcseg_core.synthetic import SyntheticScene
 
 LEAST_AREA_SHARE = 100 / (640 * 480)
-REPORT_TOLERANCE = 0.8
 
 
 class HasLabels(Protocol):
@@ -42,146 +41,6 @@ class HasLabels(Protocol):
     def labels(self) -> NDArray[np.int32]: ...
     @property
     def surface_labels(self) -> NDArray[np.int32]: ...
-
-
-@dataclass(frozen=True)
-class LabelMetrics:
-    """How well machine regions match truth regions.
-
-    Attributes
-    ----------
-    hoover : tuple of HooverResult
-        One for each tolerance of the sweep.
-    voi_bits : float
-        Variation of information H(truth | machine) + H(machine | truth), base 2; 0 is perfect. Unlabelled
-        pixels form one machine region of their own.
-    voi_split_bits, voi_merge_bits : float
-        Its two terms: H(machine | truth) grows with over-, H(truth | machine) with under-segmentation.
-    rand, adjusted_rand : float
-        Share of pixel pairs on which both agree; the same corrected for chance. Unlabelled as for `voi_bits`.
-    covering : float
-        Mean over truth pixels of the best intersection over union of their region with a machine region.
-    coverage : float
-        Share of truth pixels that carry a machine label.
-    truth_regions, machine_regions : int
-    crumbs : int
-        Machine regions below the minimum area.
-    """
-
-    hoover: tuple[HooverResult, ...]
-    voi_bits: float
-    voi_split_bits: float
-    voi_merge_bits: float
-    rand: float
-    adjusted_rand: float
-    covering: float
-    coverage: float
-    truth_regions: int
-    machine_regions: int
-    crumbs: int
-
-    def at(self, tolerance: float = REPORT_TOLERANCE) -> HooverResult:
-        """The classification at one tolerance of the sweep.
-
-        Raises
-        ------
-        InputError
-            When the sweep does not hold this tolerance.
-        """
-        for result in self.hoover:
-            if abs(result.tolerance - tolerance) < 1e-9:
-                return result
-        known = ", ".join(f"{r.tolerance:g}" for r in self.hoover)
-        raise InputError(f"tolerance {tolerance:g} was not evaluated; the sweep holds {known}")
-
-
-@dataclass(frozen=True)
-class PartMetrics:
-    """Figures for truth that labels whole objects, of which a machine region may be a part.
-
-    Attributes
-    ----------
-    purity : float
-        Share of labelled truth pixels that lie in the truth object which holds most of their machine region.
-    boundary_recall : float
-        Share of the pixels on a border of two truth objects that have a machine border within 2 px
-        (Euclidean). NaN when no two truth objects touch.
-    coverage : float
-        Share of truth pixels that carry a machine label.
-    parts_per_object : float
-        Mean over objects. A machine region is a part of the object that holds most of it. It counts
-        min(1, pixels / s) with s the larger of 50 px (at 640 x 480) and 1 % of the object; each unlabelled
-        pixel of the object counts 1 / s. So crumbs count by their area: neither breaking a region into
-        crumbs nor leaving pixels unlabelled ever lowers the figure. An object without any part counts as 1.
-    raw_parts_per_object : float
-        The plain number of machine regions, of any size, that lie mainly in the object.
-    best_iou : float
-        Mean over objects of the largest intersection over union with a single machine region.
-    objects : int
-    """
-
-    purity: float
-    boundary_recall: float
-    coverage: float
-    parts_per_object: float
-    raw_parts_per_object: float
-    best_iou: float
-    objects: int
-
-
-@dataclass(frozen=True)
-class ReconstructionMetrics:
-    """Error of the reconstruction against the noise-free scene, over valid pixels that were reconstructed.
-
-    Attributes
-    ----------
-    depth_error_sigmas : float
-        Median of |z - z_true| / sigma_z, sigma_z the sensor's own noise at the pixel.
-    depth_rms_sigmas : float
-        Root mean square of the same.
-    color_error_levels : float
-        Median over pixels of the largest channel's |error|, 0-255 levels.
-    completeness : float
-        Share of the valid truth pixels that were reconstructed.
-    """
-
-    depth_error_sigmas: float
-    depth_rms_sigmas: float
-    color_error_levels: float
-    completeness: float
-
-
-@dataclass(frozen=True)
-class SceneMetrics:
-    """All figures of one frame; None where its truth does not allow them.
-
-    `regions`: machine regions in the image; `labelled`: share of the valid pixels that carry a label.
-    """
-
-    name: str
-    regions: int
-    labelled: float
-    labels: LabelMetrics | None = None
-    parts: PartMetrics | None = None
-    reconstruction: ReconstructionMetrics | None = None
-
-    def figures(self) -> dict[str, float]:
-        """All figures but Hoover's classes, by name."""
-        found = {"regions": float(self.regions), "labelled": self.labelled}
-        if self.labels is not None:
-            keys = ("crumbs", "voi_bits", "rand", "adjusted_rand", "covering", "coverage")
-            found |= {key: float(getattr(self.labels, key)) for key in keys}
-        for group in (self.parts, self.reconstruction):
-            if group is not None:
-                found |= asdict(group)
-        return found
-
-    def row(self, tolerance: float = REPORT_TOLERANCE) -> dict[str, Any]:
-        """Flat name -> number for tables and CSV files, with Hoover's classes at one tolerance."""
-        row: dict[str, Any] = {"frame": self.name}
-        if self.labels is not None:
-            row |= self.labels.at(tolerance).counts()
-        return row | self.figures()
 
 
 def least_area(shape: tuple[int, ...]) -> float:
@@ -198,7 +57,8 @@ def without_slivers(
     small = sizes < minimum_area
     if len(small):
         small[0] = False
-    return mask & ~np.append(small, np.zeros(int(truth.max()) + 1 - len(small), bool))[truth]
+    small = np.append(small, np.zeros(int(truth.max()) + 1 - len(small), bool))
+    return np.asarray(mask & ~small[truth])
 
 
 def evaluate_labels(
@@ -334,13 +194,16 @@ def evaluate_scene(
     truth = scene.labels if level == "regions" else scene.surface_labels
     valid = scene.frame.valid
     labels = evaluate_labels(truth, machine, mask=valid, tolerances=tolerances, minimum_area=minimum_area)
-    reconstruct = getattr(result, "reconstruct", None)
+    reconstruction = None
+    if hasattr(result, "reconstruct"):
+        points, color = result.reconstruct()
+        reconstruction = evaluate_reconstruction(points, color, scene)
     return SceneMetrics(
         name=f"{scene.family}_{scene.seed:03d}",
         regions=int(np.count_nonzero(np.bincount(machine.ravel())[1:])),
         labelled=float(np.mean(machine[valid] > 0)),
         labels=labels,
-        reconstruction=None if reconstruct is None else evaluate_reconstruction(*reconstruct(), scene),
+        reconstruction=reconstruction,
     )
 
 

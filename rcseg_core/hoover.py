@@ -55,12 +55,12 @@ class Contingency:
     @property
     def truth_sizes(self) -> NDArray[np.int64]:
         """(N,): P[n], the machine's unlabelled pixels included."""
-        return self.counts[1:].sum(axis=1)
+        return np.asarray(self.counts[1:].sum(axis=1))
 
     @property
     def machine_sizes(self) -> NDArray[np.int64]:
         """(M,): P[m], pixels without a truth region included."""
-        return self.counts[:, 1:].sum(axis=0)
+        return np.asarray(self.counts[:, 1:].sum(axis=0))
 
     def without_crumbs(self, minimum_area: float) -> Contingency:
         """The table with machine regions of less than `minimum_area` pixels turned into unlabelled pixels."""

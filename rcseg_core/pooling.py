@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from rcseg_core.evaluation import REPORT_TOLERANCE, SceneMetrics
+from rcseg_core.metrics import REPORT_TOLERANCE, SceneMetrics
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from .paint import Paint
 
 Array = NDArray[np.float64]
 
+UP = np.array([0.0, 0.0, 1.0])
 NEAR_M = 1e-4
 """Hits closer than this along the ray are the origin itself."""
 
@@ -264,7 +265,7 @@ def box(base_center: Array, size: tuple[float, float, float], yaw: float) -> Pol
     """A box of `size` (length, width, height) that stands on `base_center`, turned by `yaw` about the
     vertical z."""
     axes = np.array([[np.cos(yaw), np.sin(yaw), 0.0], [-np.sin(yaw), np.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
-    center = np.asarray(base_center, float) + [0.0, 0.0, size[2] / 2]
+    center = np.asarray(base_center, float) + size[2] / 2 * UP
     normals = np.concatenate([axes, -axes])
     half = np.tile(np.asarray(size) / 2, 2)
     return Polyhedron(normals, normals @ center + half, center, float(np.linalg.norm(size) / 2))
@@ -274,7 +275,7 @@ def prism(
     base_center: Array, radius: float, height: float, sides: int, yaw: float, taper: float
 ) -> Polyhedron:
     """A regular prism (taper 0) or a frustum whose sides lean inward by the angle `taper` (rad); z is up."""
-    center = np.asarray(base_center, float) + [0.0, 0.0, height / 2]
+    center = np.asarray(base_center, float) + height / 2 * UP
     angle = yaw + 2 * np.pi * np.arange(sides) / sides
     side = np.stack(
         [np.cos(angle) * np.cos(taper), np.sin(angle) * np.cos(taper), np.full(sides, np.sin(taper))], 1

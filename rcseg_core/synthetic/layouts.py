@@ -13,13 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .geometry import Cylinder, Plane, Polyhedron, Solid, Sphere, box, prism, random_rotation, wedge
-from .paint import Paint, distinct_colors, ellipse, rectangle
+from .geometry import UP, Cylinder, Plane, Polyhedron, Solid, Sphere, box, prism, random_rotation, wedge
+from .paint import Paint, PaintedRegion, distinct_colors, ellipse, rectangle
 from .scanner import billiard, painting
 
 Array = NDArray[np.float64]
 
-UP = np.array([0.0, 0.0, 1.0])
 KINECT_SIGMA_INVERSE_M = 1.425e-3
 """Khoshelham & Elberink 2012: sigma_z = 1.425e-3 z^2, so that 1/z has this constant sigma in 1/m."""
 
@@ -47,7 +46,7 @@ def camera_rotation(yaw: float, pitch: float, roll: float) -> Array:
     right = np.array([np.cos(yaw), -np.sin(yaw), 0.0])
     down = np.cross(forward, right)
     turn = np.array([[np.cos(roll), np.sin(roll), 0.0], [-np.sin(roll), np.cos(roll), 0.0], [0.0, 0.0, 1.0]])
-    return turn @ np.stack([right, down, forward])
+    return np.asarray(turn @ np.stack([right, down, forward]))
 
 
 def aimed_pose(
@@ -103,7 +102,7 @@ def painted_box(rng: np.random.Generator, body: Polyhedron, size: tuple[float, f
     paints = []
     for _ in range(len(body.normals)):
         base = random_color(rng) if many else color
-        regions: tuple = ()
+        regions: tuple[PaintedRegion, ...] = ()
         if rng.random() < 0.2:
             half = 0.5 * min(size) * rng.uniform(0.35, 0.7, 2)
             regions = ((rectangle((0.0, 0.0), (half[0], half[1])), distinct_colors(rng, 1, avoid=base)[0]),)
@@ -114,7 +113,7 @@ def painted_box(rng: np.random.Generator, body: Polyhedron, size: tuple[float, f
 def painted_ball(rng: np.random.Generator, center: Array, radius: float) -> Solid:
     """A ball of one colour, or of two halves."""
     base = random_color(rng)
-    regions: tuple = ()
+    regions: tuple[PaintedRegion, ...] = ()
     if rng.random() < 0.3:
         regions = ((lambda coords: coords[:, 2] > 0, distinct_colors(rng, 1, avoid=base)[0]),)
     return Solid(Sphere(center, radius, random_rotation(rng)), (Paint(base, regions),), "ball")
@@ -146,7 +145,7 @@ def _walls(
     away = np.array([-np.sin(yaw), np.cos(yaw), 0.0])
     color = random_color(rng)
     colors = [color if rng.random() < 0.4 else random_color(rng) for _ in range(3)]
-    poster: tuple = ()
+    poster: tuple[PaintedRegion, ...] = ()
     if rng.random() < 0.5:
         half = (rng.uniform(0.2, 0.5), rng.uniform(0.15, 0.4))
         middle = (rng.uniform(-0.8, 0.8), rng.uniform(0.5, 1.4))
@@ -161,7 +160,7 @@ def _walls(
 
 def _floor(rng: np.random.Generator, rug_ahead: tuple[float, float]) -> Solid:
     base = random_color(rng)
-    rug: tuple = ()
+    rug: tuple[PaintedRegion, ...] = ()
     if rng.random() < 0.4:
         middle, half = (rng.uniform(-0.6, 0.6), rng.uniform(*rug_ahead)), tuple(rng.uniform(0.25, 0.7, 2))
         shape = (
@@ -193,7 +192,7 @@ def room(rng: np.random.Generator) -> Layout:
         solids.append(painted_box(rng, box(base, size, yaw), size))
         if rng.random() < 0.3 and size[2] < 0.4:
             upper = (size[0] * rng.uniform(0.4, 0.7), size[1] * rng.uniform(0.4, 0.7), rng.uniform(0.1, 0.3))
-            top = base + [0.0, 0.0, size[2]]
+            top = base + size[2] * UP
             solids.append(painted_box(rng, box(top, upper, yaw + rng.uniform(-0.3, 0.3)), upper))
     radius, half = rng.uniform(0.06, 0.18), rng.uniform(0.12, 0.4)
     if (base := places.place(radius, 1.1, back, 0.5)) is not None:

@@ -17,6 +17,8 @@ from rcseg_core.errors import InputError
 Array = NDArray[np.float64]
 Mask = Callable[[Array], NDArray[np.bool_]]
 
+PaintedRegion = tuple[Mask, Array]
+"""Where on the face, and in which colour."""
 LEAST_DIFFERENCE = 45.0
 """Least distance, in the largest channel and in 0-255 levels, of two colours that are told apart by colour
 alone."""
@@ -27,7 +29,7 @@ class Paint:
     """Colours of one face: `base` and painted regions, the later over the earlier; all in 0-255 levels."""
 
     base: Array
-    regions: tuple[tuple[Mask, Array], ...] = ()
+    regions: tuple[PaintedRegion, ...] = ()
     variation: Callable[[Array], Array] | None = None
     texture: Callable[[Array], Array] | None = None
 

@@ -11,8 +11,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from .geometry import Plane, Solid, Sphere, random_rotation
-from .paint import Mask, Paint, band, disc, distinct_colors
+from .geometry import UP, Plane, Solid, Sphere, random_rotation
+from .paint import Mask, Paint, PaintedRegion, band, disc, distinct_colors
 
 Array = NDArray[np.float64]
 
@@ -42,9 +42,7 @@ def _stroke(center: Array, along: Array, half: tuple[float, float]) -> Mask:
     return mask
 
 
-def _number_disc(
-    center: Array, along: Array, strokes: int, white: Array, ink: Array
-) -> list[tuple[Mask, Array]]:
+def _number_disc(center: Array, along: Array, strokes: int, white: Array, ink: Array) -> list[PaintedRegion]:
     """A white disc with one to three bars of ink in it."""
     painted = [(disc(center, np.cos(0.36)), white)]
     across = np.cross(center, along)
@@ -60,7 +58,7 @@ def _ball_paint(rng: np.random.Generator, to_scanner: Array) -> Paint:
     more or less."""
     kind = rng.choice(["striped", "spots", "patchwork"])
     colors = distinct_colors(rng, 9)
-    regions: list[tuple[Mask, Array]] = []
+    regions: list[PaintedRegion] = []
     if kind == "striped":
         width, ring = rng.uniform(0.35, 0.6), rng.uniform(0.08, 0.14)
         regions.append((band(2, -width, width), colors[1]))
@@ -113,8 +111,10 @@ def billiard(rng: np.random.Generator) -> tuple[list[Solid], float, float]:
         first, second = _tilted(rng, 0.12)
         base = distinct_colors(rng, 2)
         line = rng.uniform(-0.5, 0.5) * height_m
-        halves: tuple = ((lambda coords: coords[:, 0] > line, base[1]),) if rng.random() < 0.5 else ()
-        plate = Plane(center + [0.0, 0.0, 1.15 * radius], first, second)
+        halves: tuple[PaintedRegion, ...] = (
+            ((lambda coords: coords[:, 0] > line, base[1]),) if rng.random() < 0.5 else ()
+        )
+        plate = Plane(center + 1.15 * radius * UP, first, second)
         solids.append(Solid(plate, (Paint(base[0], halves),), "plate"))
     return solids, height_m, rng.uniform(1.2e-4, 2.5e-4)
 
@@ -124,7 +124,11 @@ def _wavy(rng: np.random.Generator, level: float, size: float) -> Callable[[Arra
     waves = [
         (rng.uniform(0.002, 0.008) * size, rng.uniform(2, 9) / size, rng.uniform(0, 6.3)) for _ in range(2)
     ]
-    return lambda s: level + sum(a * np.sin(k * s + phase) for a, k, phase in waves)
+
+    def edge(s: Array) -> Array:
+        return np.asarray(level + np.sum([a * np.sin(k * s + phase) for a, k, phase in waves], axis=0))
+
+    return edge
 
 
 def _stripe(axis: int, low: Callable[[Array], Array], high: Callable[[Array], Array]) -> Mask:
@@ -147,7 +151,7 @@ def painting(rng: np.random.Generator) -> tuple[list[Solid], float, float]:
     levels = np.linspace(-reach, reach, count + 1)
     levels[1:-1] += rng.uniform(-0.2, 0.2, count - 1) * (levels[1] - levels[0])
     edges = [_wavy(rng, level, height_m) for level in levels]
-    regions: list[tuple[Mask, Array]] = []
+    regions: list[PaintedRegion] = []
     for i in range(count):
         # Neighbours share their edge, as wet bands do, or leave a strip of bare board between them.
         gap = (levels[i + 1] - levels[i]) * rng.uniform(0.15, 0.3)

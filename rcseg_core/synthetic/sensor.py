@@ -91,12 +91,13 @@ def white_noise(rng: np.random.Generator, shape: tuple[int, int], correlation_px
     # 1.
     kernel /= np.sqrt(np.sum(kernel**2))
     padded = rng.normal(size=(shape[0] + 2 * half, shape[1] + 2 * half))
-    return cv2.sepFilter2D(padded, cv2.CV_64F, kernel, kernel)[half : half + shape[0], half : half + shape[1]]
+    smooth = cv2.sepFilter2D(padded, cv2.CV_64F, kernel, kernel)
+    return np.asarray(smooth[half : half + shape[0], half : half + shape[1]])
 
 
 def disturb(rng: np.random.Generator, signal: Array, noise: RangeNoise) -> Array:
     """`signal` (H, W) with noise and then quantisation."""
-    noisy = signal + noise.sigma * white_noise(rng, signal.shape, noise.correlation_px)  # type: ignore[arg-type]
+    noisy = signal + noise.sigma * white_noise(rng, (signal.shape[0], signal.shape[1]), noise.correlation_px)
     return np.round(noisy / noise.step) * noise.step if noise.step > 0 else noisy
 
 
@@ -160,4 +161,4 @@ def light(
     direct = lambert * falloff
     if seen is not None:
         direct = direct * seen(points)
-    return ambient + (1 - ambient) * direct
+    return np.asarray(ambient + (1 - ambient) * direct)

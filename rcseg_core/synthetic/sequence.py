@@ -8,10 +8,9 @@ from numpy.typing import NDArray
 
 from rcseg_core.errors import InputError
 
-from .geometry import Plane, Solid, box
+from .geometry import UP, Plane, Solid, box
 from .layouts import (
     KINECT_SIGMA_INVERSE_M,
-    UP,
     Footprints,
     Layout,
     camera_rotation,
