@@ -51,7 +51,7 @@ NODE_PARAMETERS = (
         choices=("auto", "reliable", "best_effort"),
     ),
     _option("qos.depth", 5, "history of the subscriptions", "messages", 1, 1000),
-    _option("diagnostics.warn_period_s", 10.0, "each kind of rejection is warned of once a period", "s", 0.1, 3600.0),
+    _option("diagnostics.warn_period_s", 10.0, "a rejection is warned of once a period", "s", 0.1, 3600.0),
 )  # fmt: skip
 
 # Taken over between two frames; the others build subscriptions and are read at configure.

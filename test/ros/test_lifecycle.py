@@ -1,0 +1,134 @@
+"""Lifecycle manners: cycles that leave nothing behind, impossible requests survived, clean exits in mid-frame."""
+
+from __future__ import annotations
+
+import signal
+import time
+
+import numpy as np
+import pytest
+
+SECOND = 1_000_000_000
+T0 = 1_710_000_000 * SECOND
+
+
+@pytest.fixture
+def idle(live, tmp_path):
+    """A node that was not started by itself, with its peer."""
+    process = live.NodeProcess(tmp_path / "log.txt", {"autostart": False}, {"__node": "idle"})
+    peer = live.Peer("idle")
+    yield peer, process
+    peer.close()
+    assert process.stop()[0] == 0, process.output()
+
+
+def test_cycles_leave_nothing_behind(live, idle):
+    peer, process = idle
+    frame = live.scene()
+    assert peer.state() == "unconfigured"
+    topics_before = sorted(peer.node.get_publisher_names_and_types_by_node("idle", "/"))
+    for cycle in range(2):
+        assert peer.change_state("configure") and peer.state() == "inactive"
+        assert peer.change_state("activate") and peer.state() == "active"
+        peer.connected("points", "image", "camera_info")
+        stamp = T0 + cycle * SECOND
+        peer.send(frame, stamp)
+        labels = live.image_array(peer.wait_for("labels", stamp))
+        np.testing.assert_array_equal(labels, live.expected_labels(frame))
+        assert peer.change_state("deactivate") and peer.state() == "inactive"
+        received = len(peer.received["labels"])
+        peer.send(frame, stamp + SECOND // 2)
+        time.sleep(0.5)
+        assert len(peer.received["labels"]) == received, "an inactive node published"
+        assert peer.change_state("cleanup") and peer.state() == "unconfigured"
+        live.wait_until(lambda: not peer.publishers["points"].get_subscription_count(), 10)
+        live.wait_until(
+            lambda: sorted(peer.node.get_publisher_names_and_types_by_node("idle", "/")) == topics_before, 10
+        )
+    assert "Traceback" not in process.output()
+
+
+def test_reactivation_without_cleanup(live, idle):
+    peer, _ = idle
+    frame = live.scene()
+    assert peer.change_state("configure")
+    for cycle in range(3):
+        assert peer.change_state("activate")
+        peer.connected("points", "image", "camera_info")
+        peer.send(frame, T0 + cycle)  # the same second each time: pairing starts anew
+        peer.wait_for("labels", T0 + cycle)
+        assert peer.change_state("deactivate")
+
+
+def test_impossible_transitions_are_answered_and_survived(idle):
+    peer, process = idle
+    for label in ("activate", "cleanup", "no such transition"):
+        assert not peer.change_state(label)
+    assert peer.state() == "unconfigured"
+    assert "Traceback" not in process.output()
+
+
+def test_configure_that_fails_says_why_and_can_be_mended(idle):
+    peer, process = idle
+    assert peer.set_parameters(input__extrinsic_rotation=[0.0, 0.0, 0.0, 0.0])[0].successful
+    assert not peer.change_state("configure")
+    assert peer.state() == "unconfigured"
+    assert "expected a quaternion that is not zero" in process.output()
+    assert peer.set_parameters(input__extrinsic_rotation=[0.0, 0.0, 0.0, 1.0])[0].successful
+    assert peer.change_state("configure") and peer.state() == "inactive"
+
+
+def test_shutdown_transition_ends_the_work_not_the_process(idle):
+    peer, process = idle
+    assert peer.change_state("configure") and peer.change_state("activate")
+    assert peer.change_state("shutdown")
+    assert peer.state() == "finalized"
+    assert process.process.poll() is None
+
+
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
+def test_signals_in_mid_frame(live, tmp_path, how):
+    process = live.NodeProcess(tmp_path / "log.txt", {}, {"__node": "doomed"})
+    process.wait_for_output("active")
+    peer = live.Peer("doomed", ("labels",))
+    peer.connected("points", "image", "camera_info")
+    big = live.scene(height=480, width=640)
+    for i in range(5):
+        peer.send(big, T0 + i * SECOND)
+    time.sleep(0.05)
+    code, seconds = process.stop(how)
+    peer.close()
+    assert code == 0, process.output()
+    assert seconds < 2.0
+    assert "Traceback" not in process.output()
+
+
+def test_signal_while_unconfigured(live, tmp_path):
+    process = live.NodeProcess(tmp_path / "log.txt", {"autostart": False}, {"__node": "sleeper"})
+    peer = live.Peer("sleeper", ())
+    assert peer.state() == "unconfigured"
+    code, seconds = process.stop(signal.SIGTERM)
+    peer.close()
+    assert code == 0 and seconds < 2.0, process.output()
+
+
+@pytest.mark.parametrize(
+    ("parameters", "words"),
+    [
+        ({"sync.slop_ms": 5}, "sync.slop_ms = 5: expected float 0.0 to 10000.0 ms (write a decimal point)"),
+        ({"grouping.range_tolerance": 7.0}, "grouping.range_tolerance = 7.0: expected float 0.0 to 0.5"),
+        ({"qos.reliability": "perhaps"}, "qos.reliability = 'perhaps': expected one of auto, reliable, best_effort"),
+        ({"seeds.min_window": 13}, "seeds.min_window = 13 is larger than seeds.max_window = 11"),
+    ],
+)
+def test_a_wrong_parameter_at_start_is_one_line_and_exit_code_2(live, tmp_path, parameters, words):
+    process = live.NodeProcess(tmp_path / "log.txt", parameters)
+    assert process.process.wait(30) == 2
+    assert words in process.output()
+    assert len(process.output().strip().splitlines()) == 1
+
+
+def test_a_misspelt_parameter_is_named(live, tmp_path):
+    process = live.NodeProcess(tmp_path / "log.txt", {"autostart": False, "grouping.range_tolerence": 0.01})
+    process.wait_for_output("did you mean grouping.range_tolerance?")
+    assert process.stop()[0] == 0

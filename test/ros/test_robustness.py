@@ -1,0 +1,184 @@
+"""Nothing that arrives on a topic ends the node: it is counted by its reason, shown in diagnostics, and work goes on."""
+
+from __future__ import annotations
+
+import itertools
+import time
+
+import numpy as np
+import pytest
+
+from rcseg_core import RangeColorFrame
+
+SECOND = 1_000_000_000
+stamps = itertools.count(1_730_000_000 * SECOND, SECOND)
+
+
+@pytest.fixture(scope="module")
+def frame(live):
+    return live.scene()
+
+
+@pytest.fixture
+def still_works(live, peer, frame):
+    """After the test, a good frame must come out right."""
+    yield
+    stamp = next(stamps)
+    peer.send(frame, stamp)
+    np.testing.assert_array_equal(live.image_array(peer.wait_for("labels", stamp)), live.expected_labels(frame))
+
+
+def _truncated(message):
+    message.data = message.data[: len(message.data) // 2]
+    return message
+
+
+def _changed(message, **fields):
+    for name, value in fields.items():
+        setattr(message, name, value)
+    return message
+
+
+def _without_field(message, name):
+    message.fields = [field for field in message.fields if field.name != name]
+    return message
+
+
+BAD_PAIRS = {
+    "truncated_data": lambda live, f, t: (_truncated(live.cloud_of(f, t)), live.image_of(f, t)),
+    "truncated image": lambda live, f, t: (live.cloud_of(f, t), _truncated(live.image_of(f, t))),
+    "no data": lambda live, f, t: (_changed(live.cloud_of(f, t), data=b""), live.image_of(f, t)),
+    "missing_field": lambda live, f, t: (_without_field(live.cloud_of(f, t), "z"), live.image_of(f, t)),
+    "unknown_encoding": lambda live, f, t: (live.cloud_of(f, t), _changed(live.image_of(f, t), encoding="nv99")),
+    "bad_step": lambda live, f, t: (live.cloud_of(f, t), _changed(live.image_of(f, t), step=7)),
+    "huge size": lambda live, f, t: (live.cloud_of(f, t), _changed(live.image_of(f, t), height=2**31, width=2**31)),
+    "point_step 0": lambda live, f, t: (_changed(live.cloud_of(f, t), point_step=0), live.image_of(f, t)),
+    "empty_cloud": lambda live, f, t: (_changed(live.cloud_of(f, t), height=0, width=0, data=b""), live.image_of(f, t)),
+    "NaN only": lambda live, f, t: (_nan_cloud(live, f, t), live.image_of(f, t)),
+    "other size": lambda live, f, t: (live.cloud_of(f, t), live.image_of(live.scene(height=60, width=80), t)),
+}  # fmt: skip
+
+
+def _nan_cloud(live, frame, stamp):
+    message = live.cloud_of(frame, stamp)
+    message.data = np.full(len(message.data) // 4, np.nan, np.float32).tobytes()
+    return message
+
+
+@pytest.mark.parametrize("kind", BAD_PAIRS)
+def test_bad_messages_are_rejected_by_reason(live, peer, frame, kind, still_works):
+    def rejections():
+        return sum(int(v.split()[0]) for k, v in peer.diagnostics().items() if k.startswith("rejected."))
+
+    live.wait_until(peer.diagnostics, 5)
+    before, stamp = rejections(), next(stamps)
+    cloud, image = BAD_PAIRS[kind](live, frame, stamp)
+    peer.publish(camera_info=live.camera_info_of(frame, stamp))
+    peer.publish(points=cloud, image=image)
+    live.wait_until(lambda: rejections() > before, 10, peer.diagnostics)
+    if " " not in kind:
+        assert f"rejected.{kind}" in peer.diagnostics()
+    assert not any(key.startswith("rejected.internal") for key in peer.diagnostics()), peer.diagnostics()
+
+
+def test_bad_camera_info(live, peer, frame, still_works):
+    stamp = next(stamps)
+    peer.publish(camera_info=_changed(live.camera_info_of(frame, stamp), k=np.zeros(9)))
+    peer.publish(points=live.cloud_of(frame, stamp), image=live.image_of(frame, stamp))
+    live.wait_until(lambda: "rejected.uncalibrated_camera" in peer.diagnostics(), 10, peer.diagnostics)
+
+
+def test_warnings_are_throttled(live, peer, node, frame, still_works):
+    for _ in range(20):
+        stamp = next(stamps)
+        peer.publish(camera_info=live.camera_info_of(frame, stamp))
+        peer.publish(points=live.cloud_of(frame, stamp), image=_changed(live.image_of(frame, stamp), encoding="odd"))
+        time.sleep(0.02)
+    live.wait_until(lambda: peer.count("rejected.unknown_encoding") >= 2, 10, peer.diagnostics)
+    assert node.output().count("rejected (unknown_encoding)") <= 3
+
+
+def test_late_missing_duplicated_and_reordered_messages(live, peer, frame, still_works):
+    labels = live.expected_labels(frame)
+    good = [next(stamps) for _ in range(6)]
+    info = live.camera_info_of(frame, good[0])
+    cloud, image = (lambda t: live.cloud_of(frame, t)), (lambda t: live.image_of(frame, t))
+    peer.publish(camera_info=info)
+    script = [
+        ("image", good[0]), ("points", good[0]),                          # image first
+        ("points", good[1]),                                              # its image never comes
+        ("points", good[2]), ("points", good[2]), ("image", good[2]), ("image", good[2]),  # duplicated
+        ("points", good[4]), ("image", good[4]), ("points", good[3]),     # late, though within the second
+        ("image", good[5] + 5_000_000), ("points", good[5]), ("image", good[5] + 40_000_000),  # near, 5 ms off
+    ]  # fmt: skip
+    for topic, stamp in script:
+        peer.publish(**{topic: cloud(stamp) if topic == "points" else image(stamp)})
+        time.sleep(0.15)
+    for stamp in (good[0], good[2], good[4], good[5]):
+        np.testing.assert_array_equal(live.image_array(peer.wait_for("labels", stamp)), labels)
+    time.sleep(0.3)
+    received = [live.stamp_of(m) for m in peer.received["labels"]]
+    assert all(received.count(stamp) == 1 for stamp in (good[0], good[2], good[4], good[5]))
+    assert good[1] not in received and good[3] not in received
+    live.wait_until(lambda: peer.count("dropped.duplicate_range") >= 1, 5, peer.diagnostics)
+
+
+def test_time_that_jumps_back_starts_anew(live, peer, frame, still_works):
+    """A bag that loops: the second round has the stamps of the first."""
+    start = next(stamps)
+    for _ in range(2):
+        before = len(peer.received["labels"])
+        for stamp in range(start, start + 3 * SECOND, SECOND):
+            peer.send(frame, stamp)
+            time.sleep(0.15)
+        live.wait_until(lambda before=before: len(peer.received["labels"]) >= before + 3, 10, peer.diagnostics)
+
+
+def test_stamps_of_zero_are_paired_by_arrival(live, peer, frame):
+    before = len(peer.received["labels"])
+    for _ in range(3):
+        peer.publish(camera_info=live.camera_info_of(frame, 0))
+        peer.publish(image=live.image_of(frame, 0), points=live.cloud_of(frame, 0))
+        time.sleep(0.3)
+    live.wait_until(lambda: len(peer.received["labels"]) >= before + 2, 10, peer.diagnostics)
+    assert live.stamp_of(peer.received["labels"][-1]) == 0
+
+
+def test_best_effort_publishers_are_heard(live, frame, tmp_path):
+    process = live.NodeProcess(tmp_path / "log.txt", {}, {"__node": "of_driver"})
+    process.wait_for_output("active")
+    peer = live.Peer("of_driver", ("labels",), reliable=False)
+    process.wait_for_output("offers best effort only", 20)
+    peer.connected("points", "image", "camera_info")
+    small = live.scene(height=48, width=64)
+
+    def heard():
+        peer.send(small, next(stamps))
+        time.sleep(0.2)
+        return peer.received["labels"]
+
+    live.wait_until(heard, 20, peer.diagnostics)
+    peer.close()
+    assert process.stop()[0] == 0, process.output()
+
+
+def test_frames_wait_for_a_camera_that_is_announced(live, frame, tmp_path):
+    process = live.NodeProcess(tmp_path / "log.txt", {"input.camera": "required"}, {"__node": "waiting"})
+    process.wait_for_output("active")
+    peer = live.Peer("waiting", ("labels",))
+    peer.connected("points", "image", "camera_info")
+    stamp = next(stamps)
+    peer.send(frame, stamp, camera=False)
+    time.sleep(0.5)
+    assert not peer.received["labels"]
+    peer.publish(camera_info=live.camera_info_of(frame, stamp))
+    labels = live.image_array(peer.wait_for("labels", stamp))
+    expected = live.expected_labels(RangeColorFrame(frame.points, frame.color, live.CAMERA))
+    np.testing.assert_array_equal(labels, expected)
+    peer.close()
+    assert process.stop()[0] == 0, process.output()
+
+
+def test_silence_is_reported(live, peer):
+    live.wait_until(lambda: peer.diagnostics().get("message", "").startswith("no input for"), 15, peer.diagnostics)
+    assert peer.diagnostics()["level"] == str(b"\x01")
