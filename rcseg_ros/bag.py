@@ -6,6 +6,7 @@ beginning up to the damage instead, so that all frames before it are saved; `Rec
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -39,6 +40,14 @@ class RawMessage:
     topic: str
     log_ns: int
     data: bytes = field(repr=False)
+
+    @property
+    def stamp_ns(self) -> int:
+        """Stamp of a message that begins with a header; the time of recording where that is zero."""
+        if len(self.data) < 12:
+            return self.log_ns
+        sec, nanosec = struct.unpack_from("<iI" if self.data[1] & 1 else ">iI", self.data, 4)
+        return sec * 1_000_000_000 + nanosec or self.log_ns
 
 
 class _Source(Protocol):

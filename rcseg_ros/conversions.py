@@ -122,6 +122,13 @@ def decode_depth(message: Any) -> NDArray[np.float32]:
     return depth_m
 
 
+def decode_labels(message: Any) -> NDArray[np.int32]:
+    """Label image (H, W) from a 16UC1 Image; 0 is unlabelled."""
+    if str(message.encoding) not in ("16UC1", "mono16"):
+        raise MessageError("unknown_encoding", f"labels: expected encoding 16UC1, got {message.encoding!r}")
+    return _pixels(message, np.dtype(np.uint16), 1).astype(np.int32)
+
+
 def _decode_compressed_depth(message: Any) -> NDArray[np.float32]:
     form = str(message.format)
     if "compressedDepth" not in form or not form.startswith("16UC1"):
@@ -191,7 +198,7 @@ _POINT_FIELD_TYPES = dict(enumerate(("i1", "u1", "i2", "u2", "i4", "u4", "f4", "
 def decode_cloud(message: Any) -> Cloud:
     """Points and colour of a PointCloud2: fields of any order, offset and type, any byte order and padding.
 
-    Colour comes from ``rgb`` or ``rgba`` (packed into a float32 or an integer) or from ``r``, ``g`` and ``b``.
+    Colour comes from ``rgb`` or ``rgba`` (packed into a float32 or an integer) or from ``r``, ``g``, ``b``.
 
     Raises
     ------

@@ -1,0 +1,218 @@
+"""The command `rcseg`: options in, one call, exit code out.
+
+Exit codes: 0; 1 unexpected; 2 bad usage or input, one line on stderr; 130 interrupted, with what was finished
+readable. Heavy modules are imported inside the commands, so that --help and completion answer at once.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, Optional
+
+import typer
+
+app = typer.Typer(
+    name="rcseg",
+    no_args_is_help=True,
+    rich_markup_mode="markdown",
+    pretty_exceptions_enable=False,
+    help="Segment registered range and colour images into Bezier patches (Boulanger's Bayesian method).",
+    epilog="Start with: `rcseg replay RECORDING -o OUT --overlays`",
+)
+
+# Typer before 0.16 and Python 3.10 need typing.Optional where a newer pair takes "X | None".
+ConfigFile = Annotated[
+    Optional[Path],  # noqa: UP045
+    typer.Option("--config", "-c", help="YAML file of parameters (`rcseg config --yaml` writes one)."),
+]
+Settings = Annotated[
+    Optional[list[str]],  # noqa: UP045
+    typer.Option("--set", "-s", metavar="KEY=VALUE", help="One parameter; may be given several times."),
+]
+Force = Annotated[bool, typer.Option("--force", "-f", help="Replace an earlier result of rcseg there.")]
+Output = Annotated[
+    Optional[Path],  # noqa: UP045
+    typer.Option("--output", "-o", help="Folder to write; by default NAME_rcseg in this folder."),
+]
+
+
+@app.command(epilog="Example: `rcseg replay drive.mcap -o drive_regions --overlays --set grouping.max_gap=2`")
+def replay(
+    bag: Annotated[Path, typer.Argument(help=".mcap file or rosbag2 folder.", show_default=False)],
+    output: Output = None,
+    config: ConfigFile = None,
+    set_: Settings = None,
+    topics: Annotated[
+        Optional[list[str]],  # noqa: UP045
+        typer.Option(
+            metavar="KEY=TOPIC",
+            help="range=, color= or camera_info=, several separated by commas; KEY=none does without.",
+        ),
+    ] = None,
+    range_from: Annotated[str, typer.Option(help="auto, points or depth.")] = "auto",
+    slop: Annotated[float, typer.Option(min=0, help="Largest difference of stamps in a pair, ms.")] = 20.0,
+    outputs: Annotated[str, typer.Option(help="What to write, separated by commas.")] = "all",
+    overlays: Annotated[bool, typer.Option("--overlays", help="Write a PNG of each frame too.")] = False,
+    force: Force = False,
+    workers: Annotated[int, typer.Option(min=1, max=64, help="Frames that are segmented at once.")] = 1,
+    max_frames: Annotated[Optional[int], typer.Option(min=1, help="Stop after so many.")] = None,  # noqa: UP045
+) -> None:
+    """Segment a recording: a result bag, metrics.json, config.yaml and a table."""
+    from rcseg_ros.replay import ReplayRequest
+    from rcseg_ros.settings import load_config
+    from rcseg_ros.terminal import run_replay
+
+    request = ReplayRequest(
+        bag=bag,
+        output=output or Path(f"{bag.absolute().stem}_rcseg"),
+        config=load_config(config, set_ or ()),
+        topics=_parse_topics(topics or ()),
+        range_from=_choice("--range-from", range_from, ("auto", "points", "depth")),
+        slop_ns=round(slop * 1e6),
+        outputs=_parse_outputs(outputs),
+        overlays=overlays,
+        force=force,
+        workers=workers,
+        max_frames=max_frames,
+    )
+    raise typer.Exit(run_replay(request))
+
+
+@app.command(
+    epilog="Examples: `rcseg segment frame.npz` or "
+    "`rcseg segment --color rgb.png --depth depth.png --intrinsics 525,525,319.5,239.5`"
+)
+def segment(
+    frame: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Argument(help=".npz with color and points (and K), or color, depth and K.", show_default=False),
+    ] = None,
+    color: Annotated[Optional[Path], typer.Option(help="Colour picture, 8 bit.")] = None,  # noqa: UP045
+    depth: Annotated[Optional[Path], typer.Option(help="Depth picture, 16 bit, 0: none.")] = None,  # noqa: UP045
+    intrinsics: Annotated[str, typer.Option(metavar="FX,FY,CX,CY", help="Camera, in pixels.")] = "",
+    depth_unit: Annotated[float, typer.Option(min=1e-6, help="Metres of one step of depth.")] = 0.001,
+    output: Output = None,
+    config: ConfigFile = None,
+    set_: Settings = None,
+    force: Force = False,
+) -> None:
+    """Segment one frame: labels.png (16 bit), surface_labels.png, overlay.png, regions.json."""
+    from rcseg_ros.segment_one import read_images, read_npz, segment_to_folder
+    from rcseg_ros.settings import load_config
+    from rcseg_ros.terminal import prepare, print_regions
+
+    settings = load_config(config, set_ or ())
+    if frame is not None and color is None and depth is None:
+        data, name = read_npz(frame), frame.stem
+    elif frame is None and color is not None and depth is not None and intrinsics:
+        data, name = read_images(color, depth, intrinsics, depth_unit), color.stem
+    else:
+        raise _bad_input("segment: give either FRAME.npz, or --color, --depth and --intrinsics together")
+    folder = output or Path(f"{name}_rcseg")
+    prepare(settings)
+    print_regions(segment_to_folder(data, settings, folder, force), folder)
+
+
+@app.command(
+    epilog="Example: `rcseg config --yaml my.yaml`, change it, then `rcseg replay BAG --config my.yaml`"
+)
+def config(
+    yaml: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(help="Write the parameters to this file instead; - for the screen."),
+    ] = None,
+    config_file: ConfigFile = None,
+    set_: Settings = None,
+    force: Annotated[bool, typer.Option("--force", "-f", help="Overwrite the file.")] = False,
+) -> None:
+    """Print every parameter: value, default, unit, bounds, the paper's symbol."""
+    from rcseg_ros.settings import config_yaml, load_config
+    from rcseg_ros.terminal import print_config
+
+    settings = load_config(config_file, set_ or ())
+    if yaml is None:
+        print_config(settings)
+    elif str(yaml) == "-":
+        print(config_yaml(settings), end="")
+    elif yaml.exists() and not force:
+        raise _bad_input(f"{yaml}: exists already; name another file, or overwrite it with --force")
+    else:
+        try:
+            yaml.write_text(config_yaml(settings), "utf-8")
+        except OSError as error:
+            raise _bad_input(f"{yaml}: cannot write: {error.strerror}") from None
+
+
+@app.command(epilog="Example: `rcseg inspect demo --frame 0`")
+def inspect(
+    result: Annotated[Path, typer.Argument(help="Folder that `rcseg replay` wrote.", show_default=False)],
+    frame: Annotated[Optional[int], typer.Option(min=0, help="Show the regions of this frame.")] = None,  # noqa: UP045
+) -> None:
+    """Show what a result bag holds, frame by frame, region by region."""
+    from rcseg_ros.inspect import inspect_bag
+    from rcseg_ros.terminal import CONSOLE
+
+    inspect_bag(result, frame, CONSOLE)
+
+
+def _bad_input(text: str) -> Exception:
+    from rcseg_core.errors import InputError
+
+    return InputError(text)
+
+
+def _parse_topics(items: Sequence[str]) -> dict[str, str]:
+    named = {}
+    for item in (part for entry in items for part in entry.split(",")):
+        key, equals, topic = item.partition("=")
+        if not equals or not topic:
+            raise _bad_input(f"--topics {item}: expected KEY=TOPIC, for example color=/camera/image_raw")
+        named[key.strip()] = topic.strip()
+    return named
+
+
+def _parse_outputs(text: str) -> tuple[str, ...]:
+    from rcseg_ros.segmenting import OUTPUTS
+
+    if text == "all":
+        return OUTPUTS
+    return tuple(_choice("--outputs", name.strip(), OUTPUTS) for name in text.split(","))
+
+
+def _choice(option: str, value: str, choices: Sequence[str]) -> str:
+    if value not in choices:
+        raise _bad_input(f"{option} {value}: expected one of {', '.join(choices)}")
+    return value
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; return the exit code."""
+    try:
+        code = app(args=arguments, prog_name="rcseg", standalone_mode=False)
+    except (KeyboardInterrupt, typer.Abort):
+        print("rcseg: interrupted", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        sys.stderr.close()  # the reader of our output has gone; Python would complain of it at exit
+        return 0
+    except Exception as error:
+        from rcseg_core.errors import RcsegError
+
+        usage: Any = error  # click's usage errors, whichever copy of click typer brings
+        if hasattr(error, "format_message"):
+            return _refuse(f"{usage.format_message()} (`rcseg --help` tells more)")
+        if isinstance(error, RcsegError):
+            return _refuse(str(error))
+        raise
+    return code if isinstance(code, int) else 0
+
+
+def _refuse(text: str) -> int:
+    print("rcseg: " + " ".join(text.split()), file=sys.stderr)
+    return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main())

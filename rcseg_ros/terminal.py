@@ -1,0 +1,128 @@
+"""What the command line shows: progress with frames a second, and the tables at the end."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from rcseg_core import Segmentation, SegmenterConfig
+from rcseg_core.config import describe
+from rcseg_core.errors import InputError
+from rcseg_ros.replay import ReplayRequest, ReplaySummary, replay
+from rcseg_ros.settings import bounds
+from rcseg_ros.warmup import warm_up
+
+CONSOLE = Console(highlight=False)
+_PROGRESS = Console(stderr=True)
+
+
+def prepare(config: SegmenterConfig) -> None:
+    """Compile or load the kernels; tell when it takes long."""
+    warm_up(config, lambda text: CONSOLE.print(text))
+
+
+def run_replay(request: ReplayRequest) -> int:
+    """Replay with a progress bar and a table; return the exit code."""
+    if not request.bag.exists():
+        raise InputError(f"{request.bag}: no such file or folder")
+    prepare(request.config)
+    with Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[rate]} frames/s, left"),
+        TimeRemainingColumn(),
+        console=_PROGRESS,
+        transient=True,
+        disable=not _PROGRESS.is_terminal,
+    ) as progress:
+        task = progress.add_task(request.bag.name, total=None, rate="-")
+
+        def on_frame(done: int, total: int) -> None:
+            rate = progress.tasks[task].speed or 0.0
+            progress.update(task, completed=done, total=total, rate=f"{rate:.1f}")
+
+        summary = replay(request, on_frame)
+    if summary.frames:
+        CONSOLE.print(_summary_table(summary))
+        CONSOLE.print(_notes(request, summary), soft_wrap=True)
+    if summary.interrupted:
+        raise KeyboardInterrupt
+    if summary.damage:
+        raise InputError(
+            f"{'; '.join(summary.damage)}; {len(summary.frames)} frames before it are in {request.output}"
+        )
+    return 0
+
+
+def _summary_table(summary: ReplaySummary) -> Table:
+    table = Table(title=f"{len(summary.frames)} frames", title_justify="left")
+    for name in ("", "median", "least", "most"):
+        table.add_column(name, justify="left" if not name else "right")
+    frames = summary.frames
+
+    def row(name: str, values: Iterable[float], form: str) -> None:
+        known = [value for value in values if value is not None]
+        if known:
+            table.add_row(name, *(form.format(f(known)) for f in (median, min, max)))
+
+    row("regions", (f["regions"] for f in frames), "{:.0f}")
+    row("surfaces", (f["surfaces"] for f in frames), "{:.0f}")
+    row("pixels with range", (f["valid_share"] for f in frames), "{:.1%}")
+    row("pixels in regions", (f["labelled_share"] for f in frames), "{:.1%}")
+    for stage in frames[0]["stages_ms"]:
+        row(f"{stage} \\[ms]", (f["stages_ms"].get(stage) for f in frames), "{:.1f}")
+    row("segment, all stages \\[ms]", (f["segment_ms"] for f in frames), "{:.1f}")
+    for kind in sorted({kind for f in frames for kind in f.get("truth", {})}):
+        judged = [f["truth"][kind] for f in frames if kind in f.get("truth", {})]
+        row(
+            f"correct of truth, {kind}", (t["correct"] / max(t["truth_regions"], 1) for t in judged), "{:.1%}"
+        )
+        row(f"variation of information, {kind} \\[bit]", (t["voi_bits"] for t in judged), "{:.3f}")
+    return table
+
+
+def _notes(request: ReplayRequest, summary: ReplaySummary) -> str:
+    inputs = summary.inputs
+    sources = [inputs.range, inputs.color or "its own colour", inputs.camera_info or "no camera_info"]
+    lost = [f"{count} {reason}" for reason, count in (summary.rejected + summary.dropped).items()]
+    lines = [
+        f"from {', '.join(sources)}",
+        f"{len(summary.frames) / summary.seconds:.1f} frames/s with reading and writing",
+        f"left out: {', '.join(lost)}" if lost else "nothing left out",
+        f"results in {request.output}",
+    ]
+    if summary.first_error:
+        lines.insert(3, f"first rejected frame: {summary.first_error}")
+    return "\n".join(lines)
+
+
+def print_regions(result: Segmentation, folder: Path) -> None:
+    """One line on what was found and where it is."""
+    surfaces = int(result.surface_labels.max(initial=0))
+    CONSOLE.print(
+        f"{len(result.regions)} regions on {surfaces} surfaces; written to {folder}", soft_wrap=True
+    )
+
+
+def print_config(config: SegmenterConfig) -> None:
+    """Every parameter as a table."""
+    table = Table(show_lines=False)
+    for name in ("parameter", "value", "default", "bounds and unit", "symbol", "meaning"):
+        table.add_column(name, overflow="fold", no_wrap=name == "parameter")
+    for parameter in describe(config):
+        changed = parameter.value != parameter.default
+        value = f"[bold]{_text(parameter.value)}[/bold]" if changed else _text(parameter.value)
+        cells = (value, _text(parameter.default), bounds(parameter), parameter.symbol, parameter.doc)
+        table.add_row(parameter.key, *cells)
+    CONSOLE.print(table)
+
+
+def _text(value: Any) -> str:
+    return str(value).lower() if isinstance(value, bool) else str(value)
