@@ -157,6 +157,10 @@ class GroupingConfig:
         20.0, "approximation limit of the colour models", unit="levels", low=0.0, high=255.0,
         symbol="epsilon_t (colour)",
     )  # fmt: skip
+    relief_tolerance: float = _param(
+        0.1, "a curved surface may miss this share of its own relief (rms about a plane), where that is more",
+        unit="fraction of relief", low=0.0, high=1.0,
+    )  # fmt: skip
     noise_share: float = _param(
         0.6, "systematic part of the noise that more pixels do not average away", unit="sigma", low=0.0, high=10.0
     )
@@ -204,6 +208,10 @@ class AbsorptionConfig:
     min_region: int = _param(
         30, "smaller leftovers join a neighbour instead of becoming a region", unit="px at 640x480", low=1,
         high=10000,
+    )  # fmt: skip
+    speck: int = _param(
+        120, "regions below this whose pixels a neighbour predicts dissolve into it", unit="px at 640x480",
+        low=1, high=100000,
     )  # fmt: skip
     refine_passes: int = _param(
         2, "passes in which boundary pixels move to the neighbour that predicts them better", low=0, high=20

@@ -25,6 +25,8 @@ SMOOTH_PX = 5
 SMOOTH_GAIN = 0.25
 #: A crease pixel is kept where its Laplacian is at least this share of the strongest within RIDGE_PX.
 RIDGE_SHARE, RIDGE_PX = 0.75, 5
+#: Wider than the response to one crease (orientation window plus smoothing).
+TOPHAT_PX = 13
 
 
 def _laplacian(image: NDArray[np.float32], size: int) -> NDArray[np.float32]:
@@ -52,6 +54,12 @@ def detect_edges(signals: Signals, config: EdgesConfig) -> NDArray[np.uint8]:
     sigma, depth_share = _local_sigma(signals)
     is_step = step > np.maximum(config.depth_threshold * sigma, config.depth_step * depth_share)
 
+    # the filters see a mirrored image beyond the border: no crease there
+    rim = config.orientation_window // 2 + SMOOTH_PX // 2
+    crease[:rim] = crease[-rim:] = 0
+    crease[:, :rim] = crease[:, -rim:] = 0
+    # top-hat: a curved surface has a second difference everywhere, a crease only along a line
+    crease -= cv2.morphologyEx(crease, cv2.MORPH_OPEN, np.ones((TOPHAT_PX, TOPHAT_PX), np.uint8))
     ridge = crease >= RIDGE_SHARE * cv2.dilate(crease, np.ones((RIDGE_PX, RIDGE_PX), np.uint8))
     is_crease = ridge & (crease > config.orientation_threshold * SMOOTH_GAIN * sigma)
     # a step leaves creases in the whole smoothed neighbourhood: they belong to the step

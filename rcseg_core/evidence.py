@@ -27,7 +27,7 @@ class Rule(NamedTuple):
     """What a comparison goes by, the same for all pairs of a pass.
 
     kind : BOUNDED, CHOW or BAYES; n_range, channels : int; law, color_eps2 : see Signals;
-    share2 : squared noise share; beta2 : beta^2 of eq. (20); use_range, use_color : whether a modality counts;
+    share2 : squared noise share; relief2 : squared relief tolerance; beta2 : beta^2 of eq. (20); use_range, use_color : whether a modality counts;
     terms : exponents of the models by degree, (p, 2) int64 each; terms[1] is a plane or the bilinear form;
     degree : (N + 1, 2) int64, degree of range and colour of each region; a pair takes the higher of the two (step 6)
     """
@@ -38,6 +38,7 @@ class Rule(NamedTuple):
     law: NDArray[np.float64]
     color_eps2: float
     share2: float
+    relief2: float
     beta2: float
     use_range: bool
     use_color: bool
@@ -96,7 +97,10 @@ def channel_span(rule, modality):  # type: ignore[no-untyped-def]
 
 @kernel
 def own_residuals(moments, k, rule, work, out):  # type: ignore[no-untyped-def]
-    """Residual sums of squares of region k about its own models: out[0] range, out[1] colour."""
+    """Residual sums of squares of region k about its own models: out[0] range, out[1] colour.
+
+    out[2]: range about a first-degree model where the own degree is higher, else inf.
+    """
     for modality in range(2):
         first, last = channel_span(rule, modality)
         terms = rule.terms[rule.degree[k, modality]]
@@ -104,6 +108,26 @@ def own_residuals(moments, k, rule, work, out):  # type: ignore[no-untyped-def]
         out[modality] = residual(
             moments.power[k], moments.cross[k], moments.energy[k], first, last, terms, work.coef
         )
+    out[2] = np.inf
+    if rule.degree[k, 0] > 1:
+        solve(moments.power[k], moments.cross[k], 0, rule.n_range, rule.terms[1], work.gram, work.coef)
+        out[2] = residual(
+            moments.power[k], moments.cross[k], moments.energy[k], 0, rule.n_range, rule.terms[1], work.coef
+        )
+
+
+@kernel
+def earned_tolerance(eps2, relief2, n, rss_flat, var):  # type: ignore[no-untyped-def]
+    """The tolerance that a side may claim in a higher-degree model, from what its first-degree model misses.
+
+    The tolerance is there for shapes that no polynomial follows. A side that is flat to within the noise needs
+    none: two such sides that only a bent model with tolerance could join are the two faces of a crease. A side
+    with much relief may miss a share of it: a quartic follows a hemisphere to 2 % of its radius, however large.
+    """
+    relief = max(rss_flat / n - var, 0.0)
+    if relief == np.inf:
+        return eps2
+    return min(max(eps2, relief2 * relief), relief)
 
 
 @kernel
@@ -148,16 +172,21 @@ def _bounded(moments, big, small, rule, own, gate_r, gate_c, work):  # type: ign
             residual(work.power, work.cross, moments.energy[small], first, last, terms, work.coef)
             - own[small, modality]
         )
+        budget_big = n_big * eps2
+        budget_small = n_small * eps2
+        if modality == 0:
+            budget_big = n_big * earned_tolerance(eps2, rule.relief2, n_big, own[big, 2], var * rule.n_range)
+            budget_small = n_small * earned_tolerance(eps2, rule.relief2, n_small, own[small, 2], var * rule.n_range)
         if rule.kind == CHOW:
             n = n_big + n_small
-            ratio, need = _excess(rise_big + rise_small, noise + n * share, n * eps2)
+            ratio, need = _excess(rise_big + rise_small, noise + n * share, budget_big + budget_small)
             value = max(value, ratio)
             height = max(height, need)
         else:
-            ratio, need = _excess(rise_big, noise + n_big * share, n_big * eps2)
+            ratio, need = _excess(rise_big, noise + n_big * share, budget_big)
             value = max(value, ratio)
             height = max(height, need)
-            ratio, need = _excess(rise_small, noise + n_small * share, n_small * eps2)
+            ratio, need = _excess(rise_small, noise + n_small * share, budget_small)
             value = max(value, ratio)
             height = max(height, need)
     return value, height
@@ -231,7 +260,7 @@ def _bayes(moments, big, small, rule, own, boxes, work):  # type: ignore[no-unty
 def compare(moments, i, j, rule, own, boxes, gate_r, gate_c, work):  # type: ignore[no-untyped-def]
     """Compare two regions.
 
-    own : (N, 2) residuals of each region's own models; gate_r, gate_c : shares of the boundary free of edges
+    own : (N, 3) residuals of each region's own models, see own_residuals; gate_r, gate_c : shares of the boundary free of edges
 
     Returns
     -------

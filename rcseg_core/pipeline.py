@@ -107,7 +107,7 @@ def absorb_points(partition: Partition, signals: Signals, models: Models, config
     """Step 3: points join the regions that predict them; what hangs together and fits nowhere is a region."""
     absorb(signals, partition.labels, partition.leaves, models, config.absorption.max_cost)
     measured = signals.flags & INVALID == 0
-    partition.add_leftovers(measured, least_region(signals.flags, config))
+    partition.add_leftovers(measured, scaled(config.absorption.min_region, signals.flags))
 
 
 def finish(
@@ -115,7 +115,9 @@ def finish(
 ) -> tuple[Moments, Models, NDArray[np.int64], object]:
     """Degrees by the nested tests, boundary pixels to the better side, specks to a neighbour; the final models."""
     if config.absorption.enabled:
-        partition.drop_small(least_region(signals.flags, config))
+        partition.drop_small(scaled(config.absorption.speck, signals.flags))
+        models = final_models(partition, signals, config)[1]
+        absorb_points(partition, signals, models, config)
         models = final_models(partition, signals, config)[1]
         for limit in (1e4, 1e12):  # the order still matters; the limit no longer does
             absorb(signals, partition.labels, partition.leaves, models, limit)
@@ -134,9 +136,9 @@ def final_models(
     return moments, fit_models(moments, degree, signals.n_range)
 
 
-def least_region(flags: NDArray[np.uint8], config: SegmenterConfig) -> int:
-    """Pixels below which a leftover is no region, for this image size."""
-    return max(4, round(config.absorption.min_region * flags.size / (640 * 480)))
+def scaled(pixels: int, image: NDArray[np.uint8]) -> int:
+    """An area that is given for 640x480, for the size of this image."""
+    return max(4, round(pixels * image.size / (640 * 480)))
 
 
 class Clock:

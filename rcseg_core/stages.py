@@ -38,6 +38,7 @@ def make_rule(
         signals.law,
         signals.color_eps2,
         config.grouping.noise_share**2,
+        config.grouping.relief_tolerance**2,
         config.grouping.prior_beta**2,
         True,
         use_color,
