@@ -22,7 +22,7 @@ from rcseg_core import SegmenterConfig
 from rcseg_core.drawing import write_png
 from rcseg_core.errors import InputError
 from rcseg_ros.bag import RawMessage, Recording, Topic
-from rcseg_ros.result_bag import ResultBag
+from rcseg_ros.result_bag import NAMESPACE, BagWriter
 from rcseg_ros.segmenting import OUTPUTS, FrameResult, FrameWork
 from rcseg_ros.settings import config_yaml
 from rcseg_ros.staging import StagedFolder
@@ -237,21 +237,21 @@ class _Writer:
     def __init__(self, folder: Path, overlays: bool) -> None:
         self._folder = folder
         self._overlays = overlays
-        self._bag: ResultBag | None = None
+        self._bag: BagWriter | None = None
         self._pictures = 0
 
-    def _open(self) -> ResultBag:
+    def _open(self) -> BagWriter:
         if self._bag is None:
-            self._bag = ResultBag(self._folder)
+            self._bag = BagWriter(self._folder)
         return self._bag
 
     def transform(self, topic: Topic, raw: RawMessage) -> None:
-        self._open().copy(topic, raw.data, raw.log_ns)
+        self._open().write(topic.name, topic.type, raw.data, raw.log_ns, topic.qos)
 
     def add(self, result: FrameResult) -> None:
         bag = self._open()
         for output in result.outputs:
-            bag.write(output, result.log_ns)
+            bag.write(f"{NAMESPACE}/{output.topic}", output.type, output.data, result.log_ns)
         if result.picture is not None:
             folder = self._folder / "overlays"
             folder.mkdir(exist_ok=True)

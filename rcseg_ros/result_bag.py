@@ -6,7 +6,7 @@ rcseg_msgs are taken from the .msg files with their comments, so that the bag ex
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 from types import TracebackType
@@ -26,7 +26,6 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from rcseg_core.errors import InputError
-from rcseg_ros.bag import Topic
 
 NAMESPACE = "/rcseg"  # the node's name: its ~/labels is /rcseg/labels
 _HERE = Path(__file__).resolve().parent
@@ -39,6 +38,9 @@ def _qos(durability: QosDurability) -> Qos:
         QosHistory.KEEP_LAST, 10, QosReliability.RELIABLE, durability, never, never,
         QosLiveliness.AUTOMATIC, never, False,
     )  # fmt: skip
+
+
+RELIABLE, LATCHED = _qos(QosDurability.VOLATILE), _qos(QosDurability.TRANSIENT_LOCAL)
 
 
 @lru_cache(maxsize=1)
@@ -84,17 +86,8 @@ def definition_text(type_name: str) -> str:
     return _SEPARATOR.join(section if section.endswith("\n") else section + "\n" for section in sections)
 
 
-@dataclass(frozen=True)
-class Output:
-    """A serialised result: name of the topic below the node's, type, CDR bytes."""
-
-    topic: str
-    type: str
-    data: bytes
-
-
-class ResultBag:
-    """A result bag that is being written; `close` makes it readable, whatever happened before.
+class BagWriter:
+    """A rosbag2 folder that is being written; `close` makes it readable, whatever happened before.
 
     Parameters
     ----------
@@ -107,37 +100,22 @@ class ResultBag:
         self._writer.open()
         self._connections: dict[str, Connection] = {}
 
-    def write(self, output: Output, log_ns: int) -> None:
-        """Add a result."""
-        topic = f"{NAMESPACE}/{output.topic}"
+    def write(self, topic: str, type_name: str, data: bytes, log_ns: int, qos: Sequence[Qos] = ()) -> None:
+        """Add a message, serialised to CDR; the first of a topic decides its type and QoS."""
         if topic not in self._connections:
             self._connections[topic] = self._writer.add_connection(
                 topic,
-                output.type,
-                msgdef=definition_text(output.type),
-                rihs01=result_types().hash_rihs01(output.type),
-                offered_qos_profiles=[_qos(QosDurability.VOLATILE)],
+                type_name,
+                msgdef=definition_text(type_name),
+                rihs01=result_types().hash_rihs01(type_name),
+                offered_qos_profiles=qos or (LATCHED if topic == "/tf_static" else RELIABLE,),
             )
-        self._writer.write(self._connections[topic], log_ns, output.data)
-
-    def copy(self, topic: Topic, data: bytes, log_ns: int) -> None:
-        """Add a message of the input as it is (transforms, for instance)."""
-        if topic.name not in self._connections:
-            durability = (
-                QosDurability.TRANSIENT_LOCAL if topic.name == "/tf_static" else QosDurability.VOLATILE
-            )
-            self._connections[topic.name] = self._writer.add_connection(
-                topic.name,
-                topic.type,
-                typestore=result_types(),
-                offered_qos_profiles=topic.qos or [_qos(durability)],
-            )
-        self._writer.write(self._connections[topic.name], log_ns, data)
+        self._writer.write(self._connections[topic], log_ns, data)
 
     def close(self) -> None:
         self._writer.close()
 
-    def __enter__(self) -> ResultBag:
+    def __enter__(self) -> BagWriter:
         return self
 
     def __exit__(

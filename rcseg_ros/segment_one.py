@@ -55,7 +55,7 @@ def _parse_intrinsics(text: str) -> PinholeCamera:
 
 
 def read_npz(path: Path) -> RangeColorFrame:
-    """Frame from an .npz: ``color`` and ``points`` (with ``K`` if there is a camera), or ``depth`` and ``K``."""
+    """Frame from an .npz: ``color`` and ``points`` (``K`` too, of a camera), or ``depth`` and ``K``."""
     try:
         with np.load(path, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}

@@ -26,10 +26,19 @@ from rcseg_ros.outputs import (
     labels_message,
     picture_message,
 )
-from rcseg_ros.result_bag import Output, make_message, serialize
+from rcseg_ros.result_bag import make_message, serialize
 from rcseg_ros.sync import Pair
 
 OUTPUTS = ("labels", "surface_labels", "regions", "edges", "overlay", "reconstruction")
+
+
+@dataclass(frozen=True)
+class Output:
+    """A serialised result: name of the topic below the node's, type, CDR bytes."""
+
+    topic: str
+    type: str
+    data: bytes
 
 
 @dataclass(frozen=True)
