@@ -61,7 +61,9 @@ def detect_edges(signals: Signals, config: EdgesConfig) -> NDArray[np.uint8]:
     # top-hat: a curved surface has a second difference everywhere, a crease only along a line
     crease -= cv2.morphologyEx(crease, cv2.MORPH_OPEN, np.ones((TOPHAT_PX, TOPHAT_PX), np.uint8))
     ridge = crease >= RIDGE_SHARE * cv2.dilate(crease, np.ones((RIDGE_PX, RIDGE_PX), np.uint8))
-    is_crease = ridge & (crease > config.orientation_threshold * SMOOTH_GAIN * sigma)
+    # smoothing lowers correlated noise less
+    gain = SMOOTH_GAIN * np.sqrt(signals.noise.range_correlation)
+    is_crease = ridge & (crease > config.orientation_threshold * gain * sigma)
     # a step leaves creases in the whole smoothed neighbourhood: they belong to the step
     reach = config.orientation_window + SMOOTH_PX - 1
     near_step = cv2.dilate(is_step.astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0

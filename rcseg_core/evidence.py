@@ -1,8 +1,8 @@
 """How well two regions go together (section 6), from their moments alone.
 
 bounded (default): one joint model must explain BOTH sides: for each side s and each modality
-    RSS_s(joint) - RSS_s(own)  <  p + 4 sqrt(2 p)  +  n_s (share^2 + eps^2)        (everything in sigma^2)
-The first term is what noise alone costs, the second what the approximation limit eps_t allows; the value is the
+    RSS_s(joint) - RSS_s(own)  <  m (p + 4 sqrt(2 p))  +  n_s (share^2 + eps^2)     (everything in sigma^2)
+The first term is what noise alone costs when m pixels make one independent measurement, the second what the approximation limit eps_t allows; the value is the
 largest ratio of left to right, so 1 is the limit and the measure is symmetric.
 chow: the same for the total rise of both sides at once.
 bayes: c_ib of eq. (21), the larger region predicts the smaller (the other way extrapolation explodes).
@@ -27,7 +27,8 @@ class Rule(NamedTuple):
     """What a comparison goes by, the same for all pairs of a pass.
 
     kind : BOUNDED, CHOW or BAYES; n_range, channels : int; law, color_eps2 : see Signals;
-    share2 : squared noise share; relief2 : squared relief tolerance; beta2 : beta^2 of eq. (20); use_range, use_color : whether a modality counts;
+    share2 : squared noise share; relief2 : squared relief tolerance;
+    correlation : pixels an independent measurement, of range and of colour; beta2 : beta^2 of eq. (20); use_range, use_color : whether a modality counts;
     terms : exponents of the models by degree, (p, 2) int64 each; terms[1] is a plane or the bilinear form;
     degree : (N + 1, 2) int64, degree of range and colour of each region; a pair takes the higher of the two (step 6)
     """
@@ -39,6 +40,7 @@ class Rule(NamedTuple):
     color_eps2: float
     share2: float
     relief2: float
+    correlation: tuple[float, float]
     beta2: float
     use_range: bool
     use_color: bool
@@ -162,7 +164,7 @@ def _bounded(moments, big, small, rule, own, gate_r, gate_c, work):  # type: ign
             var = 1.0
             eps2 = rule.color_eps2 * gate_c * gate_c
         p = np.float64(terms.shape[0] * (last - first))
-        noise = var * (p + 4.0 * np.sqrt(2.0 * p))
+        noise = var * rule.correlation[modality] * (p + 4.0 * np.sqrt(2.0 * p))
         share = rule.share2 * var
         rise_big = (
             residual(moments.power[big], moments.cross[big], moments.energy[big], first, last, terms, work.coef)

@@ -57,7 +57,7 @@ def f_test(
 
 def choose_degrees(
     moments: Moments, n_range: int, start: NDArray[np.int64], variance: NDArray[np.float64],
-    config: GeneralizationConfig, highest: int = 4,
+    correlation: tuple[float, float], config: GeneralizationConfig, highest: int = 4,
 ) -> NDArray[np.int64]:  # fmt: skip
     """The degree of range and of colour of each region.
 
@@ -66,6 +66,7 @@ def choose_degrees(
     moments : sums up to the degrees in question
     start : (N + 1, 2) int64, degrees that are not questioned (1 to begin with)
     variance : (N + 1, 2) float64, noise variance of one pixel in whitened units, for the effect
+    correlation : pixels that make one independent measurement, of range and of colour
     highest : no degree above this is tried
 
     Returns
@@ -84,11 +85,13 @@ def choose_degrees(
         for high in range(2, min(top, moments.cross.shape[2] - 1) + 1):
             for low in range(1, high):
                 rss_low, rss_high = table[:, modality, low - 1], table[:, modality, high - 1]
-                grow = f_test(rss_low, rss_high, n, (low + 1) ** 2, (high + 1) ** 2, width) < config.alpha
+                independent = n / correlation[modality]
+                p_low, p_high = (low + 1) ** 2, (high + 1) ** 2
+                grow = f_test(rss_low, rss_high, independent, p_low, p_high, width) < config.alpha
                 if config.test == "guarded":
                     effect = (rss_low - rss_high) / np.maximum(n, 1)
                     grow &= effect > config.min_effect**2 * width * variance[:, modality]
-                grow &= n >= PIXELS_PER_COEFFICIENT * (high + 1) ** 2
+                grow &= n >= PIXELS_PER_COEFFICIENT * p_high
                 grow &= degree[index, modality] == low
                 degree[grow, modality] = high
     return degree

@@ -1,14 +1,19 @@
 """The noise Sigma_r and Sigma_c that eq. (3) whitens with: measured on the frame, or taken from a sensor model.
 
 Window residuals about a robust plane tell the noise wherever a scene is smooth; their lower quantile ignores
-windows on edges and texture. Second differences would be zero on quantised depth. The standard deviation of the
-range signal is a quadratic of the signal itself, ``sigma(w) = a + b w + c w^2``, which holds every usual sensor:
-structured light and stereo (a), constant depth noise (c, since dw = w^2 dz) and Kinect after Nguyen et al. (all).
+windows on edges and texture. Second differences would be zero on quantised depth. Structured-light depth and
+demosaiced colour are correlated over a few pixels, so n of them are worth fewer: the means of 5x5 blocks of the
+residuals tell how many pixels make one independent measurement.
+
+The standard deviation of the range signal is a quadratic of the signal itself, ``sigma(w) = a + b w + c w^2``,
+which holds every usual sensor: structured light and stereo (a), constant depth noise (c, since dw = w^2 dz) and
+Kinect after Nguyen et al. (all three).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +22,12 @@ from scipy.optimize import nnls
 from rcseg_core.config import NoiseConfig
 from rcseg_core.jit import kernel
 
-WINDOW_PX = 11
-STRIDE_PX = 16
+WINDOW_PX = 21
+STRIDE_PX = 20
+BLOCK_PX = 5
+#: Mean square of block means over variance / BLOCK_PX^2 on white noise: the plane takes a little of it.
+WHITE_BLOCKS = 0.84
+MAX_CORRELATION_PX = 25.0
 #: Share of windows whose residual is taken as pure noise: smooth windows are assumed to be at least half.
 QUANTILE = 0.3
 #: Relative floor: no range sensor repeats better than this, and exact synthetic data must not divide by zero.
@@ -42,12 +51,15 @@ class NoiseModel:
         ``sigma_c(s) = a + b s + c s^2`` for range channel c and signal value s: 1/m of inverse depth, or metres of
         x, y, z (constant then: b = c = 0).
     color : (3,) float64, levels.
+    range_correlation, color_correlation : pixels that make one independent measurement, 1 for white noise
     source : str
         "estimated" or the name of the model.
     """
 
     range_law: NDArray[np.float64]
     color: NDArray[np.float64]
+    range_correlation: float
+    color_correlation: float
     source: str
 
     def range_sigma(self, signal: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -57,14 +69,15 @@ class NoiseModel:
 
 
 @kernel
-def window_residuals(values, median, valid, spread, out_mean, out_rms):  # type: ignore[no-untyped-def]
-    """Residual rms about a plane in windows of one channel, impulses (> 6 spread from the median) left out.
+def window_residuals(values, median, valid, spread, out):  # type: ignore[no-untyped-def]
+    """Residuals about a plane in windows of one channel, impulses (> 6 spread from the median) left out.
 
-    Parameters: (H, W) values, median float32; valid bool; spread: scale of values - median. Writes (n,) float64
-    window means and rms, NaN where less than half of the window is usable. Windows of WINDOW_PX every STRIDE_PX.
+    values, median : (H, W) float32; valid : (H, W) bool; spread : scale of values - median; out : (n, 3) float64,
+    mean, rms, and the mean square of 5x5 block means times 25; NaN where under half of a window is usable.
     """
     height, width = values.shape
     half = WINDOW_PX // 2
+    per_side = WINDOW_PX // BLOCK_PX
     index = 0
     for row0 in range(0, height - WINDOW_PX + 1, STRIDE_PX):
         for col0 in range(0, width - WINDOW_PX + 1, STRIDE_PX):
@@ -89,40 +102,78 @@ def window_residuals(values, median, valid, spread, out_mean, out_rms):  # type:
                     vx += x * v
                     vy += y * v
                     vv += v * v
-            out_mean[index] = np.nan
-            out_rms[index] = np.nan
-            if s0 >= WINDOW_PX * WINDOW_PX // 2:
-                # centred 2x2 normal equations of the plane
-                axx = sxx - sx * sx / s0
-                axy = sxy - sx * sy / s0
-                ayy = syy - sy * sy / s0
-                bx = vx - sx * v0 / s0
-                by = vy - sy * v0 / s0
-                det = axx * ayy - axy * axy
-                if det > 1e-9:
-                    gx = (ayy * bx - axy * by) / det
-                    gy = (axx * by - axy * bx) / det
-                    rss = vv - v0 * v0 / s0 - gx * bx - gy * by
-                    out_mean[index] = ref + v0 / s0
-                    out_rms[index] = np.sqrt(max(rss, 0.0) / (s0 - 3.0))
+            out[index, :] = np.nan
             index += 1
+            if s0 < WINDOW_PX * WINDOW_PX // 2:
+                continue
+            # centred 2x2 normal equations of the plane
+            axx = sxx - sx * sx / s0
+            axy = sxy - sx * sy / s0
+            ayy = syy - sy * sy / s0
+            bx = vx - sx * v0 / s0
+            by = vy - sy * v0 / s0
+            det = axx * ayy - axy * axy
+            if det <= 1e-9:
+                continue
+            gx = (ayy * bx - axy * by) / det
+            gy = (axx * by - axy * bx) / det
+            g0 = ref + (v0 - gx * sx - gy * sy) / s0
+            rss = vv - v0 * v0 / s0 - gx * bx - gy * by
+            out[index - 1, 0] = ref + v0 / s0
+            out[index - 1, 1] = np.sqrt(max(rss, 0.0) / (s0 - 3.0))
+            blocks = 0.0
+            square = 0.0
+            for block in range(per_side * per_side):
+                n = 0.0
+                total = 0.0
+                for i in range(BLOCK_PX):
+                    for j in range(BLOCK_PX):
+                        y = (block // per_side) * BLOCK_PX + i
+                        x = (block % per_side) * BLOCK_PX + j
+                        r = row0 + y
+                        c = col0 + x
+                        if not valid[r, c] or abs(values[r, c] - median[r, c]) > 6.0 * spread:
+                            continue
+                        n += 1.0
+                        total += values[r, c] - g0 - gx * (x - half) - gy * (y - half)
+                if n >= 12.0:
+                    blocks += 1.0
+                    square += total * total / n
+            if blocks > 0.0:
+                out[index - 1, 2] = square / blocks
 
 
-def _window_scales(
+class _Windows(NamedTuple):
+    """Usable windows of one channel: mean and residual rms of each, and the correlation of the quieter half."""
+
+    mean: NDArray[np.float64]
+    rms: NDArray[np.float64]
+    correlation: float
+
+
+def _measure(
     values: NDArray[np.float32], median: NDArray[np.float32], valid: NDArray[np.bool_]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Means and residual rms of the usable windows of one channel."""
+) -> _Windows:
+    """Residuals of all windows of one channel."""
     height, width = values.shape
     count = max(0, (height - WINDOW_PX) // STRIDE_PX + 1) * max(0, (width - WINDOW_PX) // STRIDE_PX + 1)
-    mean, rms = np.full(count, np.nan), np.full(count, np.nan)
+    table = np.full((count, 3), np.nan)
     away = np.abs(values[::3, ::3] - median[::3, ::3])[valid[::3, ::3]]
     # 70 % of the distances are noise even when 20 % of the pixels are impulses; 1.04 sigma at 70 %
-    spread = float(np.quantile(away, 0.7)) if away.size else 0.0
-    spread = max(spread, 1e-9)
+    spread = max(float(np.quantile(away, 0.7)) if away.size else 0.0, 1e-9)
     if count:
-        window_residuals(values, median, valid, spread, mean, rms)
-    good = np.isfinite(rms)
-    return mean[good], rms[good]
+        window_residuals(values, median, valid, spread, table)
+    table = table[np.isfinite(table[:, :2]).all(axis=1)]
+    quiet = table[table[:, 1] <= np.median(table[:, 1])] if len(table) else table
+    quiet = quiet[np.isfinite(quiet[:, 2]) & (quiet[:, 1] > 0)]
+    correlation = 1.0
+    if len(quiet) >= 4:
+        correlation = float(np.median(quiet[:, 2] / quiet[:, 1] ** 2)) / WHITE_BLOCKS
+    return _Windows(table[:, 0], table[:, 1], float(np.clip(correlation, 1.0, MAX_CORRELATION_PX)))
+
+
+def _quiet_rms(rms: NDArray[np.float64]) -> float:
+    return float(np.quantile(rms, QUANTILE)) if rms.size else 0.0
 
 
 def _range_law(mean: NDArray[np.float64], rms: NDArray[np.float64], floor: float) -> NDArray[np.float64]:
@@ -165,18 +216,16 @@ def estimate_noise(
     -------
     NoiseModel
     """
-    source = config.range_model
     scale = float(np.median(np.abs(signal[..., -1][valid])))
     floor = RELATIVE_FLOOR * scale
+    windows = [_measure(signal[..., c], median[..., c], valid) for c in range(signal.shape[2])]
+    source = config.range_model
     if config.range_model == "auto":
         source = "estimated"
         if inverse_depth:
-            law = _range_law(*_window_scales(signal[..., 0], median[..., 0], valid), floor)[None]
+            law = _range_law(windows[0].mean, windows[0].rms, floor)[None]
         else:
-            sigmas = []
-            for c in range(3):
-                _, rms = _window_scales(signal[..., c], median[..., c], valid)
-                sigmas.append(float(np.quantile(rms, QUANTILE)) if rms.size else 0.0)
+            sigmas = [_quiet_rms(w.rms) for w in windows]
             # a channel cannot be trusted far beyond the noisiest: x and y follow from the same measurement
             least = max(0.3 * max(sigmas), floor)
             law = np.array([[max(s, least), 0.0, 0.0] for s in sigmas])
@@ -189,19 +238,18 @@ def estimate_noise(
         a, b, c = SENSOR_MODELS[config.range_model]
         sigma_m = (a + b / scale + c / scale**2) * scale**2  # at the median depth: dz = z^2 dw
         law = np.array([(sigma_m, 0.0, 0.0)] * 3)
-    return NoiseModel(law, _color_sigma(color, color_median, config), source)
-
-
-def _color_sigma(
-    color: NDArray[np.uint8], median: NDArray[np.uint8], config: NoiseConfig
-) -> NDArray[np.float64]:
-    if config.color_sigma > 0:
-        return np.full(3, config.color_sigma)
     everywhere = np.ones(color.shape[:2], np.bool_)
-    sigmas = []
-    for c in range(3):
-        _, rms = _window_scales(
-            color[..., c].astype(np.float32), median[..., c].astype(np.float32), everywhere
-        )
-        sigmas.append(float(np.quantile(rms, QUANTILE)) if rms.size else 0.0)
-    return np.maximum(np.array(sigmas), COLOR_FLOOR_LEVELS)
+    colors = [
+        _measure(color[..., c].astype(np.float32), color_median[..., c].astype(np.float32), everywhere)
+        for c in range(3)
+    ]
+    sigma_c = np.maximum([_quiet_rms(w.rms) for w in colors], COLOR_FLOOR_LEVELS)
+    if config.color_sigma > 0:
+        sigma_c = np.full(3, config.color_sigma)
+    return NoiseModel(
+        law,
+        sigma_c,
+        range_correlation=windows[-1].correlation,
+        color_correlation=float(np.median([w.correlation for w in colors])),
+        source=source,
+    )

@@ -39,6 +39,7 @@ def make_rule(
         signals.color_eps2,
         config.grouping.noise_share**2,
         config.grouping.relief_tolerance**2,
+        correlation(signals),
         config.grouping.prior_beta**2,
         True,
         use_color,
@@ -57,6 +58,11 @@ def noise_variance(moments: Moments, signals: Signals) -> NDArray[np.float64]:
     return out
 
 
+def correlation(signals: Signals) -> tuple[float, float]:
+    """Pixels that make one independent measurement, of range and of colour."""
+    return signals.noise.range_correlation, signals.noise.color_correlation
+
+
 def pass_degrees(
     moments: Moments, signals: Signals, degree: int, config: SegmenterConfig
 ) -> NDArray[np.int64]:
@@ -68,7 +74,7 @@ def pass_degrees(
         start[:, 1] = min(degree, general.max_color_degree)
         return start
     variance = noise_variance(moments, signals)
-    return choose_degrees(moments, signals.n_range, start, variance, general, highest=degree)
+    return choose_degrees(moments, signals.n_range, start, variance, correlation(signals), general, highest=degree)
 
 
 def group_pass(
@@ -94,7 +100,8 @@ def final_degrees(
     moments = accumulate(signals.image, signals.flags, partition.labels, partition.count, top)
     start = np.ones((partition.count + 1, 2), np.int64)
     return moments, choose_degrees(
-        moments, signals.n_range, start, noise_variance(moments, signals), general, highest=top
+        moments, signals.n_range, start, noise_variance(moments, signals), correlation(signals), general,
+        highest=top,
     )
 
 
