@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import cv2
 import numpy as np
@@ -114,7 +116,7 @@ def load_frame(path: str | Path, *, name: str | None = None) -> LabelledFrame:
 
 def _read_folder(folder: Path, name: str) -> LabelledFrame:
     meta = _read_meta(folder / "meta.json")
-    camera = PinholeCamera(*(_number(meta, key, folder) for key in ("fx", "fy", "cx", "cy")))
+    intrinsics = [_number(meta, key, folder) for key in ("fx", "fy", "cx", "cy")]
     raw = _read_image(folder / "depth.png")
     if raw.ndim != 2 or raw.dtype != np.uint16:
         raise InputError(f"{folder / 'depth.png'}: expected a 16-bit image of one channel, got {_what(raw)}")
@@ -128,47 +130,64 @@ def _read_folder(folder: Path, name: str) -> LabelledFrame:
             f"{folder}: depth.png is {raw.shape} and rgb.png is {color.shape[:2]} (rows, columns)"
         )
     truth = _read_truth(folder / "labels.png", raw.shape)
-    frame = RangeColorFrame.from_depth(depth_m, color, camera)
+    with _named(folder):
+        frame = RangeColorFrame.from_depth(depth_m, color, PinholeCamera(*intrinsics))
     return LabelledFrame(name, frame, truth, _kind(meta, folder), _background(meta, truth), has_color)
 
 
 def _read_npz(path: Path, name: str) -> LabelledFrame:
-    """`points` (H, W, 3) in the optical frame, `color` (H, W, 3), `K` (3, 3), `labels` (H, W); all but
-    points optional.
+    """`points` (H, W, 3), or `depth` (H, W) with `K` (3, 3); perhaps `color` (H, W, 3) and `labels` (H, W).
 
     A file with `xyz` instead is SynPEB's: axes x ahead, y left, z up, a spherical grid, labels of planes.
     """
-    try:
-        with np.load(path, allow_pickle=False) as data:
-            arrays = {key: data[key] for key in data.files}
-    except (OSError, ValueError, EOFError, KeyError) as error:
-        raise InputError(f"{path}: cannot be read as an .npz file ({_first_line(error)})") from error
+    arrays = _read_arrays(path)
     synpeb = "xyz" in arrays
-    if not synpeb and "points" not in arrays:
-        raise InputError(
-            f"{path}: expected an array 'points' (H, W, 3), found {', '.join(arrays) or 'nothing'}"
-        )
-    points = arrays["xyz" if synpeb else "points"]
-    if points.ndim != 3 or points.shape[2] != 3:
-        raise InputError(f"{path}: expected points of shape (H, W, 3), got {points.shape}")
-    if synpeb:
-        points = np.stack([-points[..., 1], -points[..., 2], points[..., 0]], axis=-1)
+    camera = _camera(arrays["K"], path) if "K" in arrays else None
+    points = _points(arrays, camera, path)
     has_color = "color" in arrays
     color = arrays["color"] if has_color else np.full(points.shape, PLAIN_GREY, np.uint8)
-    camera = _camera(arrays["K"], path) if "K" in arrays else None
     truth = arrays.get("labels")
     if truth is not None:
         if truth.shape != points.shape[:2] or not np.issubdtype(truth.dtype, np.integer):
-            raise InputError(
-                f"{path}: expected integer labels of shape {points.shape[:2]}, got {_what(truth)}"
-            )
+            wanted = f"integer labels of shape {points.shape[:2]}"
+            raise InputError(f"{path}: expected {wanted}, got {_what(truth)}")
+        truth = np.where(truth >= SYNPEB_FIRST_PLANE, truth, 0) if synpeb else truth
         truth = truth.astype(np.int32)
-        truth = np.where(truth >= SYNPEB_FIRST_PLANE, truth, 0).astype(np.int32) if synpeb else truth
+    with _named(path):
+        return LabelledFrame(name, RangeColorFrame(points, color, camera), truth, REGIONS, (), has_color)
+
+
+def _read_arrays(path: Path) -> dict[str, NDArray[Any]]:
     try:
-        frame = RangeColorFrame(points, color, camera)
+        with np.load(path, allow_pickle=False) as data:
+            return {key: data[key] for key in data.files}
+    except (OSError, ValueError, EOFError, AttributeError, BadZipFile) as error:
+        raise InputError(f"{path}: cannot be read as an .npz file ({_first_line(error)})") from error
+
+
+def _points(arrays: dict[str, NDArray[Any]], camera: PinholeCamera | None, path: Path) -> NDArray[Any]:
+    if "depth" in arrays and "points" not in arrays:
+        if camera is None or arrays["depth"].ndim != 2:
+            raise InputError(f"{path}: a depth (H, W) needs its camera matrix K (3, 3) beside it")
+        return camera.rays(*arrays["depth"].shape) * arrays["depth"][..., None].astype(np.float32)
+    points = arrays.get("points", arrays.get("xyz"))
+    if points is None:
+        found = ", ".join(arrays) or "nothing"
+        raise InputError(f"{path}: expected an array 'points' (H, W, 3), or 'depth' and 'K', found {found}")
+    if points.ndim != 3 or points.shape[2] != 3:
+        raise InputError(f"{path}: expected points of shape (H, W, 3), got {points.shape}")
+    if "points" in arrays:
+        return points
+    return np.stack([-points[..., 1], -points[..., 2], points[..., 0]], axis=-1)
+
+
+@contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Put the path before the message of an error that knows only the arrays."""
+    try:
+        yield
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
-    return LabelledFrame(name, frame, truth, REGIONS, (), has_color)
 
 
 def _read_meta(path: Path) -> dict[str, Any]:
@@ -238,9 +257,12 @@ def _background(meta: dict[str, Any], truth: NDArray[np.int32] | None) -> tuple[
 
 
 def _camera(matrix: NDArray[Any], path: Path) -> PinholeCamera:
-    if matrix.shape != (3, 3):
-        raise InputError(f"{path}: expected a camera matrix K of shape (3, 3), got {matrix.shape}")
-    return PinholeCamera(float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2]), float(matrix[1, 2]))
+    if matrix.shape != (3, 3) or matrix.dtype.kind not in "fiu":
+        raise InputError(f"{path}: expected a camera matrix K of shape (3, 3), got {_what(matrix)}")
+    with _named(path):
+        return PinholeCamera(
+            float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2]), float(matrix[1, 2])
+        )
 
 
 def _what(array: NDArray[Any]) -> str:

@@ -135,12 +135,16 @@ class HooverResult:
         For each row and each column of the contingency table.
     instances : tuple of Instance
         The accepted cases of correct, over and under.
+    matched : int
+        Truth regions for which the definition of correct holds, whether or not another instance explains them
+        better: a region found up to a crust that became a region of its own is matched, yet over-segmented.
     """
 
     tolerance: float
     truth_class: tuple[str, ...]
     machine_class: tuple[str, ...]
     instances: tuple[Instance, ...]
+    matched: int
 
     @property
     def correct(self) -> int:
@@ -171,8 +175,8 @@ class HooverResult:
         return len(self.truth_class)
 
     def counts(self) -> dict[str, int]:
-        """Truth regions and the number in each class; the first four classes add up to the truth regions."""
-        keys = ("truth_regions", "correct", "over", "under", "missed", "noise")
+        """Truth regions, the number in each class (the first four sum to them), and `matched`."""
+        keys = ("truth_regions", "correct", "over", "under", "missed", "noise", "matched")
         return {key: int(getattr(self, key)) for key in keys}
 
 
@@ -189,8 +193,9 @@ def classify(table: Contingency, tolerance: float) -> HooverResult:
     overlap = table.overlap.astype(float)
     truth_share = overlap / np.maximum(table.truth_sizes, 1)[:, None]
     machine_share = overlap / np.maximum(table.machine_sizes, 1)[None, :]
+    matches = _correct(truth_share, machine_share, tolerance)
     found = [
-        *_correct(truth_share, machine_share, tolerance),
+        *matches,
         *_split(OVER, table.overlap, table.truth_sizes, table.machine_sizes, machine_share, tolerance),
         *_split(UNDER, table.overlap.T, table.machine_sizes, table.truth_sizes, truth_share.T, tolerance),
     ]
@@ -206,7 +211,7 @@ def classify(table: Contingency, tolerance: float) -> HooverResult:
             truth_class[n] = instance.kind
         for m in instance.machine:
             machine_class[m] = instance.kind
-    return HooverResult(tolerance, tuple(truth_class), tuple(machine_class), tuple(accepted))
+    return HooverResult(tolerance, tuple(truth_class), tuple(machine_class), tuple(accepted), len(matches))
 
 
 def sweep(table: Contingency, tolerances: Sequence[float] = TOLERANCES) -> tuple[HooverResult, ...]:

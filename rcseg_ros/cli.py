@@ -145,6 +145,65 @@ def config(
             raise _bad_input(f"{yaml}: cannot write: {error.strerror}") from None
 
 
+@app.command(
+    epilog="Examples: `rcseg evaluate synthetic --families room,blocks --seeds 100-109` or "
+    "`rcseg evaluate FRAMES --match 'mosd_*' --labels surfaces`"
+)
+def evaluate(
+    dataset: Annotated[
+        str, typer.Argument(help="`synthetic`, one frame, or a folder of frames.", show_default=False)
+    ],
+    output: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option("--output", "-o", help="Folder to write; by default NAME_evaluation in this folder."),
+    ] = None,
+    config: ConfigFile = None,
+    set_: Settings = None,
+    families: Annotated[str, typer.Option(help="Synthetic families, separated by commas.")] = "all",
+    seeds: Annotated[str, typer.Option(help="0-99 are for tuning, 100 and up for reports.")] = "100-109",
+    size: Annotated[str, typer.Option(metavar="WIDTHxHEIGHT", help="Of synthetic frames.")] = "640x480",
+    outliers: Annotated[float, typer.Option(min=0, max=1, help="Impulse noise, share by signal.")] = 0.0,
+    dropout: Annotated[float, typer.Option(min=0, max=1, help="Share of pixels without range.")] = 0.0,
+    structured_light: Annotated[
+        bool, typer.Option("--structured-light", help="See synthetic frames as a Kinect would.")
+    ] = False,
+    match: Annotated[str, typer.Option(metavar="GLOB", help="Names of the recorded frames.")] = "*",
+    labels: Annotated[str, typer.Option(help="What is judged: regions or surfaces.")] = "regions",
+    tolerance: Annotated[float, typer.Option(help="Overlap of the tables, above 0.5.")] = 0.8,
+    pictures: Annotated[bool, typer.Option(help="Write one picture a frame.")] = True,
+    tables_only: Annotated[bool, typer.Option("--tables-only", help="Write no files.")] = False,
+    force: Force = False,
+) -> None:
+    """Compare with truth: Hoover's classes, information, parts, reconstruction; tables, files, pictures."""
+    from rcseg_ros.evaluate import SyntheticOptions, parse_families, parse_seeds, parse_size, run_evaluate
+    from rcseg_ros.settings import load_config
+    from rcseg_ros.terminal import CONSOLE, prepare
+
+    settings = load_config(config, set_ or ())
+    folder = output or Path(f"{Path(dataset).absolute().stem}_evaluation")
+    scenes = SyntheticOptions(
+        parse_families(families, structured_light=structured_light),
+        parse_seeds(seeds),
+        *parse_size(size),
+        outliers,
+        dropout,
+        structured_light,
+    )
+    run_evaluate(
+        dataset,
+        config=settings,
+        console=CONSOLE,
+        warm_up=prepare,
+        output=None if tables_only else folder,
+        force=force,
+        synthetic=scenes,
+        level=labels,
+        tolerance=tolerance,
+        match=match,
+        pictures=pictures,
+    )
+
+
 @app.command(epilog="Example: `rcseg inspect demo --frame 0`")
 def inspect(
     result: Annotated[Path, typer.Argument(help="Folder that `rcseg replay` wrote.", show_default=False)],
