@@ -1,9 +1,10 @@
-"""What the node adds to segment(), and what the transport loses: measured over real topics, between two processes.
+"""What the node adds to segment(), and what the transport loses: measured over real topics, between two
+processes.
 
 A synthetic 640x480 room is published as cloud, image and camera_info. First slowly, so that every frame is
-segmented: arrival of the last input to publication of the labels, against the segmentation alone (both as the node's
-own diagnostics tell them), and the whole way from publish to receive as the peer sees it. Then at 30 Hz, to count what
-of the inputs reaches the node. Run with the ROS wheels and rcseg_msgs installed:
+segmented: arrival of the last input to publication of the labels, against the segmentation alone (both as
+the node's own diagnostics tell them), and the whole way from publish to receive as the peer sees it. Then
+at 30 Hz, to count what of the inputs reaches the node. Run with the ROS wheels and rcseg_msgs installed:
 
     python benchmarks/latency.py [--frames 60] [--rate 30] [--default-transport]
 """
@@ -29,7 +30,9 @@ def main() -> None:
     options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     options.add_argument("--frames", type=int, default=60, help="frames of each part")
     options.add_argument("--rate", type=float, default=30.0, help="rate of the second part, Hz")
-    options.add_argument("--default-transport", action="store_true", help="without config/fastdds_large_messages.xml")
+    options.add_argument(
+        "--default-transport", action="store_true", help="without config/fastdds_large_messages.xml"
+    )
     options.add_argument("--outputs", default="labels", help="outputs that are listened to, with commas")
     given = options.parse_args()
     if not given.default_transport:
@@ -77,7 +80,7 @@ def added(live, peer, frame, count: int) -> None:
 
 
 def lost(live, peer, frame, count: int, rate_hz: float) -> None:
-    """Cloud and image at a camera's rate; the node drops what it cannot keep up with, but all must reach it."""
+    """Cloud and image at a camera's rate: the node may drop frames, the transport none."""
     before = {topic: peer.count(f"received.{topic}") for topic in ("points", "image")}
     cloud, image = live.cloud_of(frame, 0), live.image_of(frame, 0)
     start_s, start_ns = time.monotonic(), time.time_ns()
@@ -87,7 +90,8 @@ def lost(live, peer, frame, count: int, rate_hz: float) -> None:
         peer.publish(points=cloud, image=image)
     real_hz = (count - 1) / (time.monotonic() - start_s)
     time.sleep(3.0)
-    print(f"{count} frames at {real_hz:.1f} Hz, {len(cloud.data) / 1e6:.1f} MB cloud and {len(image.data) / 1e6:.1f} MB image")
+    megabytes = [len(message.data) / 1e6 for message in (cloud, image)]
+    print(f"{count} frames at {real_hz:.1f} Hz, {megabytes[0]:.1f} MB cloud and {megabytes[1]:.1f} MB image")
     for topic, number in before.items():
         print(f"  {topic:8} reached the node       {peer.count(f'received.{topic}') - number:4d} of {count}")
     for name, value in peer.diagnostics().items():

@@ -14,26 +14,26 @@ import time
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.clock import Clock, ClockType, JumpThreshold
 from rclpy.duration import Duration
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
-from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
-from rcseg_core import PinholeCamera, RangeColorFrame, segment
+from rcseg_core import segment
 from rcseg_core.errors import ConfigError, RcsegError
 from rcseg_ros.assembly import assemble_frame
 from rcseg_ros.conversions import Header, header_of
 from rcseg_ros.extrinsic import TransformListener, rigid
 from rcseg_ros.health import Health
+from rcseg_ros.inputs import Inputs
 from rcseg_ros.messages import make_rcl
 from rcseg_ros.parameters import NodeParameters
 from rcseg_ros.publishers import ResultPublishers
-from rcseg_ros.subscriptions import AdaptiveSubscription
-from rcseg_ros.sync import FrameSync, Pair
+from rcseg_ros.region_statistics import warm_up_statistics
+from rcseg_ros.sync import Pair
+from rcseg_ros.warmup import warm_up
 from rcseg_ros.worker import Worker
 
 SUCCESS, ERROR = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.ERROR
@@ -57,17 +57,13 @@ class SegmentationNode(LifecycleNode):
         for sentence in self.parameters.unknown():
             self.get_logger().warning(sentence)
         self.health = Health()
-        self._publishing = (
-            threading.Lock()
-        )  # held while the worker publishes and while publishers come and go
+        self._publishing = threading.Lock()  # held while the worker publishes and while publishers go
         self._active = False
         self._configured: list[Any] = []  # what on_configure made, undone in reverse order
         self._guard_change_state()
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        steady = Clock(
-            clock_type=ClockType.STEADY_TIME
-        )  # diagnostics go on while simulated time stands still
-        self.create_timer(1.0, self._report, clock=steady)
+        # Diagnostics go on while simulated time stands still.
+        self.create_timer(1.0, self._report, clock=Clock(clock_type=ClockType.STEADY_TIME))
         backward = JumpThreshold(
             min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=True
         )
@@ -95,14 +91,14 @@ class SegmentationNode(LifecycleNode):
         return super().on_configure(state)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        self._sync = self._new_sync()
-        self._source = self.parameters["input.range_from"]
+        self._inputs.start()
         self._active = True
-        self.get_logger().info("active: waiting for " + ", ".join(s.topic for s in self._inputs.values()))
+        self.get_logger().info(f"active: waiting for {', '.join(self._inputs.topics)}")
         return super().on_activate(state)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         self._active = False
+        self._inputs.stop()
         self._worker.clear()
         return super().on_deactivate(state)
 
@@ -129,82 +125,35 @@ class SegmentationNode(LifecycleNode):
         if parameters["input.use_tf"]:
             self._transforms = TransformListener(self)
             self._configured.append(self._transforms.destroy)
-        started_s = time.monotonic()
-        self.get_logger().info("configuring: compiling (up to a minute the first time, then cached)")
-        _warm_up(parameters.config)
-        self.get_logger().info(f"configured in {time.monotonic() - started_s:.1f} s")
+        self.get_logger().info(f"configured in {warm_up(parameters.config, self.get_logger().info):.1f} s")
+        warm_up_statistics()
         self._results = ResultPublishers(self)
-        self._configured.append(self._results.destroy)
+        self._configured.append(self._destroy_results)
         self._worker = Worker(self._process, "segment")
         self._configured.append(lambda: self._worker.stop(STOP_TIMEOUT_S))
-        self._sync = self._new_sync()
-        self._source = parameters["input.range_from"]
-        self._inputs: dict[str, AdaptiveSubscription] = {}
-        for topic, kind in (
-            ("points", PointCloud2),
-            ("depth", Image),
-            ("image", Image),
-            ("camera_info", CameraInfo),
-        ):
-            if self._source in ("auto", topic) or topic in ("image", "camera_info"):
-                self._inputs[topic] = AdaptiveSubscription(
-                    self, kind, topic, lambda message, topic=topic: self._on_message(topic, message),
-                    parameters["qos.reliability"], parameters["qos.depth"],
-                )  # fmt: skip
-                self._configured.append(self._inputs[topic].destroy)
+        self._inputs = Inputs(self, parameters, self.health, self._enqueue, self._reject)
+        self._configured.append(self._inputs.destroy)
 
     def _tear_down(self) -> None:
         while self._configured:
-            undo = self._configured.pop()
-            with self._publishing if undo == self._results.destroy else threading.Lock():
-                undo()
+            self._configured.pop()()
 
-    # Topics, on the executor's thread: pair and enqueue, nothing more.
+    def _destroy_results(self) -> None:
+        with self._publishing:
+            self._results.destroy()
 
-    def _on_message(self, topic: str, message: Any) -> None:
-        if not self._active:
-            return
-        arrived_s = time.monotonic()
-        self.health.count(f"received.{topic}")
-        # Drivers without a clock stamp zero: then the time of arrival pairs.
-        stamp_ns = header_of(message).stamp_ns or time.time_ns()
-        try:
-            pairs = self._pair(topic, stamp_ns, message)
-        except Exception as error:
-            self._reject(error, topic)
-            return
-        for pair in pairs:
-            dropped = self._worker.put(_Task(pair, arrived_s), self.parameters["input.queue"])
-            self.health.count("paired")
-            self.health.count("dropped.queue", len(dropped))
+    # Pairs, on the executor's thread: enqueued and no more.
 
-    def _pair(self, topic: str, stamp_ns: int, message: Any) -> list[Pair]:
-        color_from, camera = self.parameters["input.color_from"], self.parameters["input.camera"]
-        if topic == "camera_info":
-            return [] if camera == "none" else self._sync.add_camera(stamp_ns, message)
-        if topic == "image":
-            return [] if color_from == "cloud" else self._sync.add_color(stamp_ns, message)
-        if self._source == "auto":
-            self._source = topic
-        if topic != self._source:
-            self.health.count(f"dropped.second_source_{topic}")
-            return []
-        listed = self._inputs["image"].publishers() > 0
-        self._sync.with_color = color_from == "image" or topic == "depth" or (color_from == "auto" and listed)
-        self._sync.needs_camera = camera == "required" or (
-            camera == "auto" and self._inputs["camera_info"].publishers() > 0
-        )
-        return self._sync.add_range(stamp_ns, message)
-
-    def _new_sync(self) -> FrameSync:
-        slop_ns = round(self.parameters["sync.slop_ms"] * 1e6)
-        return FrameSync(slop_ns=slop_ns, queue_size=self.parameters["sync.queue"], live=True)
+    def _enqueue(self, pair: Pair, arrived_s: float) -> None:
+        dropped = self._worker.put(_Task(pair, arrived_s), self.parameters["input.queue"])
+        self.health.count("paired")
+        self.health.count("dropped.queue", len(dropped))
 
     def _on_time_jump(self, jump: Any) -> None:
         """Simulated time went back, as when a bag loops: what waits for a partner waits in vain."""
         if self._active:
             self.health.count("time_jumps")
-            self._sync = self._new_sync()
+            self._inputs.start_anew()
 
     # Frames, on the worker's thread.
 
@@ -245,7 +194,7 @@ class SegmentationNode(LifecycleNode):
     def _report(self) -> None:
         if not rclpy.ok():
             return
-        drops = self._sync.drops if self._configured else {}
+        drops = self._inputs.drops if self._configured else {}
         status = self.health.status(f"{self.get_name()}: segmentation", self._state(), drops, make_rcl)
         stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(
@@ -273,17 +222,6 @@ class SegmentationNode(LifecycleNode):
                 return response
 
         service.callback = guarded
-
-
-def _warm_up(config: Any) -> None:
-    """Compile, or load from the cache, all that a frame needs: both signals, on a small tilted plane."""
-    rows, cols = np.mgrid[0:96, 0:128]
-    camera = PinholeCamera(120.0, 120.0, 63.5, 47.5)
-    depth_m = (2.0 / (1.0 + 0.002 * cols + 0.001 * rows)).astype(np.float32)
-    color = np.where(cols[..., None] < 64, 60, 180).repeat(3, axis=2).astype(np.uint8)
-    with_camera = RangeColorFrame.from_depth(depth_m, color, camera)
-    for frame in (with_camera, RangeColorFrame(with_camera.points, color)):
-        segment(frame, config)
 
 
 def main(args: list[str] | None = None) -> int:

@@ -60,6 +60,13 @@ def region_statistics(
     return RegionStatistics(mean_color, center, axes, np.where(known[:, None], high - low, np.nan))
 
 
+def warm_up_statistics() -> None:
+    """Compile the two passes, or load them from the cache."""
+    region_statistics(
+        np.ones((2, 2), np.int32), np.ones((2, 2, 3), np.float32), np.ones((2, 2, 3), np.uint8), 1
+    )
+
+
 _SQUARE = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])  # where xx, xy, xz, yy, yz, zz stand in a 3x3 matrix
 
 

@@ -1,5 +1,6 @@
 """Two processes on one isolated ROS domain: the node as users start it, and a peer that publishes and
-listens."""
+listens.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Lifecycle manners: cycles that leave nothing behind, impossible requests survived, clean exits in mid-frame."""
+"""Lifecycle manners: cycles that leave nothing behind, impossible requests survived, clean exits in
+mid-frame."""
 
 from __future__ import annotations
 
@@ -117,7 +118,10 @@ def test_signal_while_unconfigured(live, tmp_path):
     [
         ({"sync.slop_ms": 5}, "sync.slop_ms = 5: expected float 0.0 to 10000.0 ms (write a decimal point)"),
         ({"grouping.range_tolerance": 7.0}, "grouping.range_tolerance = 7.0: expected float 0.0 to 0.5"),
-        ({"qos.reliability": "perhaps"}, "qos.reliability = 'perhaps': expected one of auto, reliable, best_effort"),
+        (
+            {"qos.reliability": "perhaps"},
+            "qos.reliability = 'perhaps': expected one of auto, reliable, best_effort",
+        ),
         ({"seeds.min_window": 13}, "seeds.min_window = 13 is larger than seeds.max_window = 11"),
     ],
 )

@@ -1,4 +1,5 @@
-"""Parameters: the whole config with descriptors, taken between two frames and as whole sets, or refused with a reason."""
+"""Parameters: the whole config with descriptors, taken between two frames and as whole sets, or refused
+with a reason."""
 
 from __future__ import annotations
 
@@ -18,7 +19,9 @@ stamps = itertools.count(1_720_000_000_000_000_000, 1_000_000_000)
 
 
 def test_the_default_file_is_up_to_date():
-    assert (ROOT / "config/default.yaml").read_text() == default_yaml(), "run: python -m rcseg_ros.options > config/default.yaml"
+    assert (ROOT / "config/default.yaml").read_text() == default_yaml(), (
+        "run: python -m rcseg_ros.options > config/default.yaml"
+    )
 
 
 def test_the_default_file_gives_the_defaults():
@@ -75,7 +78,11 @@ def test_a_change_takes_effect_with_the_next_frame(live, peer):
     frame, stamp = live.scene(), next(stamps)
     peer.send(frame, stamp)
     before = live.image_array(peer.wait_for("labels", stamp))
-    changes = {"grouping.color_tolerance": 120.0, "edges.color_threshold": 255.0, "absorption.min_region": 2000}
+    changes = {
+        "grouping.color_tolerance": 120.0,
+        "edges.color_threshold": 255.0,
+        "absorption.min_region": 2000,
+    }
     try:
         results = peer.set_parameters(**{k.replace(".", "__"): v for k, v in changes.items()})
         assert all(r.successful for r in results), results

@@ -1,5 +1,6 @@
 """What users rely on: every output of every frame, bit for bit what the library computes, whatever form the
-input has."""
+input has.
+"""
 
 from __future__ import annotations
 
