@@ -100,24 +100,29 @@ class Recording:
         if not files and not (path / "metadata.yaml").exists():
             raise InputError(f"{path}: neither metadata.yaml nor an .mcap file in this folder")
         try:
-            return _IndexedSource(path)
+            source = _IndexedSource(path)
+            if source.topics or not files:
+                return source
+            source.close()  # a file without summary shows its topics only when it is read through
         except Exception as error:
             # Whatever the library stumbles over: the messages before the damage can still be had one by one.
             if not files:
                 raise InputError(f"{path}: cannot be read: {_one_line(error)}") from error
             self.damage.append(f"{path}: {_one_line(error)}")
-            return _ScannedSource(files, self.damage)
+        return _ScannedSource(files, self.damage)
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
         """Messages of the given topics in the order of recording, up to the first damage."""
         try:
             yield from self._source.messages(topics)
         except Exception as error:
-            self.damage.append(f"{self.path}: {_one_line(error)}; nothing after this was read")
+            text = f"{self.path}: {_one_line(error)}; nothing after this was read"
+            if text not in self.damage:
+                self.damage.append(text)
 
     def first(self, topic: str) -> Any | None:
         """The first message of a topic, deserialised; None if there is none that can be read."""
-        raw = next(iter(self._source.messages([topic])), None) if self.topics[topic].count else None
+        raw = next(self.messages([topic]), None)
         return None if raw is None else self.decode(raw)
 
     def decode(self, raw: RawMessage) -> Any:
@@ -199,7 +204,8 @@ class _ScannedSource:
             except Exception as error:
                 damage.append(f"{path}: readable for {self._readable[path]} messages: {_one_line(error)}")
         if not any(self._readable.values()):
-            raise InputError(f"{files[0]}: cannot be read: {damage[-1].split(': ', 1)[1]}")
+            why = damage[-1].split(": ", 1)[1] if damage else "there is no message in it"
+            raise InputError(f"{files[0]}: cannot be read: {why}")
 
     @staticmethod
     def _scan(path: Path) -> Iterator[tuple[Topic, RawMessage]]:

@@ -12,7 +12,7 @@ MS = 1_000_000
 
 
 def feed(sync, events):
-    """Feed ('r' | 'c' | 'k', stamp in ms) in the given order; return the pairs as (range, color) stamps in ms."""
+    """Feed ('r' | 'c' | 'k', stamp in ms) in the given order; return the pairs' (range, color) stamps in ms."""
     add = {"r": sync.add_range, "c": sync.add_color, "k": sync.add_camera}
     pairs = [pair for kind, stamp in events for pair in add[kind](stamp * MS, (kind, stamp))]
     pairs += sync.flush()
@@ -125,8 +125,9 @@ def test_clouds_with_their_own_color_need_no_partner():
 
 def greedy(ranges, colors, slop):
     """Oracle: all candidate pairs by (difference, range, colour), each stamp used once."""
-    pairs, candidates = [], sorted(
-        (abs(r - c), r, c) for r, c in itertools.product(ranges, colors) if abs(r - c) <= slop
+    pairs, candidates = (
+        [],
+        sorted((abs(r - c), r, c) for r, c in itertools.product(ranges, colors) if abs(r - c) <= slop),
     )
     for _, r, c in candidates:
         if all(r != pair[0] and c != pair[1] for pair in pairs):
