@@ -29,6 +29,7 @@ setup(
         (f"share/{ROS_PACKAGE}", ["package.xml"]),
         (f"share/{ROS_PACKAGE}/launch", glob("launch/*.launch.py")),
         (f"share/{ROS_PACKAGE}/config", glob("config/*.*")),
+        (f"share/{ROS_PACKAGE}/config/sensors", glob("config/sensors/*.yaml")),
     ],
     install_requires=[
         "numpy>=1.26",

@@ -1,0 +1,68 @@
+"""Play a recording into the segmentation node, and show it in RViz.
+
+    ros2 launch rcseg_ros replay.launch.py bag:=BAG rate:=0.5 points:=/cloud image:=/rgb camera_info:=/info
+
+For results of every frame without a ROS graph, `rcseg replay` is the better tool: nothing is dropped there.
+"""
+
+import os
+
+from ament_index_python.packages import get_package_share_directory
+from launch.actions import DeclareLaunchArgument, ExecuteProcess, IncludeLaunchDescription
+from launch.conditions import IfCondition, UnlessCondition
+from launch.launch_description_sources import PythonLaunchDescriptionSource
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
+
+from launch import LaunchDescription
+
+PASSED_ON = ("points", "depth", "image", "camera_info")
+
+
+def generate_launch_description() -> LaunchDescription:
+    share = get_package_share_directory("rcseg_ros")
+    arguments = [
+        DeclareLaunchArgument("bag", description="rosbag2 folder or .mcap file"),
+        DeclareLaunchArgument("rate", default_value="1.0", description="playing speed"),
+        DeclareLaunchArgument(
+            "delay", default_value="5", description="seconds until it plays; 60 for a first run"
+        ),
+        DeclareLaunchArgument("loop", default_value="false", description="play again and again"),
+        DeclareLaunchArgument("rviz", default_value="true", description="show the results in RViz"),
+        DeclareLaunchArgument(
+            "config",
+            default_value=os.path.join(share, "config", "default.yaml"),
+            description="parameter file",
+        ),
+        *(
+            DeclareLaunchArgument(topic, default_value=topic, description="topic in the bag")
+            for topic in PASSED_ON
+        ),
+    ]
+    segment = IncludeLaunchDescription(
+        PythonLaunchDescriptionSource(os.path.join(share, "launch", "segment.launch.py")),
+        launch_arguments={
+            "config": LaunchConfiguration("config"),
+            "use_sim_time": "true",
+            **{topic: LaunchConfiguration(topic) for topic in PASSED_ON},
+        }.items(),
+    )
+    # A node that has run before configures within the delay; one that compiles for the first time takes a minute.
+    play = ["ros2", "bag", "play", LaunchConfiguration("bag"), "--clock"]
+    play += ["--delay", LaunchConfiguration("delay"), "--rate", LaunchConfiguration("rate")]
+    looped = LaunchConfiguration("loop")
+    return LaunchDescription(
+        [
+            *arguments,
+            segment,
+            ExecuteProcess(cmd=[*play, "--loop"], output="screen", condition=IfCondition(looped)),
+            ExecuteProcess(cmd=play, output="screen", condition=UnlessCondition(looped)),
+            Node(
+                package="rviz2",
+                executable="rviz2",
+                arguments=["-d", os.path.join(share, "config", "rcseg.rviz")],
+                parameters=[{"use_sim_time": True}],
+                condition=IfCondition(LaunchConfiguration("rviz")),
+            ),
+        ]
+    )
