@@ -22,6 +22,8 @@ app = typer.Typer(
     epilog="Start with: `rcseg replay RECORDING -o OUT --overlays`",
 )
 
+INTERRUPTED = 130
+
 # Typer before 0.16 and Python 3.10 need typing.Optional where a newer pair takes "X | None".
 ConfigFile = Annotated[
     Optional[Path],  # noqa: UP045
@@ -251,8 +253,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         code = app(args=arguments, prog_name="rcseg", standalone_mode=False)
     except (KeyboardInterrupt, typer.Abort):
-        print("rcseg: interrupted", file=sys.stderr)
-        return 130
+        code = INTERRUPTED  # typer's newer versions return it, older ones raise
     except BrokenPipeError:
         sys.stderr.close()  # the reader of our output has gone; Python would complain of it at exit
         return 0
@@ -265,6 +266,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if isinstance(error, RcsegError):
             return _refuse(str(error))
         raise
+    if code == INTERRUPTED:
+        print("rcseg: interrupted", file=sys.stderr)
     return code if isinstance(code, int) else 0
 
 

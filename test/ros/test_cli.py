@@ -1,0 +1,123 @@
+"""The command line: what each command prints and writes; help answers without loading the algorithm."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from recordings import CAMERA, depth_entries, scene, write_folder
+
+from rcseg_core import SegmenterConfig, segment
+from rcseg_core.config import describe
+from rcseg_ros.cli import main
+
+BAGS = Path(__file__).resolve().parents[2] / "bags"
+
+
+@pytest.fixture
+def rcseg(tmp_path, capsys, monkeypatch):
+    """Run the command line in an empty folder; return what it prints."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(*arguments):
+        assert main([str(argument) for argument in arguments]) == 0
+        return capsys.readouterr().out
+
+    return run
+
+
+def test_replay_prints_a_table_and_where_the_results_are(rcseg, tmp_path):
+    write_folder(tmp_path / "drive", depth_entries(2))
+    text = rcseg("replay", "drive", "--overlays", "--set", "grouping.max_gap=2")
+    assert "2 frames" in text and "regions" in text and "nothing left out" in text
+    assert "results in drive_rcseg" in text
+    assert len(list((tmp_path / "drive_rcseg" / "overlays").glob("*.png"))) == 2
+    assert yaml.safe_load((tmp_path / "drive_rcseg" / "config.yaml").read_text())["grouping"]["max_gap"] == 2
+
+
+def test_replay_of_the_bundled_sequence_with_truth(rcseg, tmp_path):
+    text = rcseg("replay", BAGS / "tabletop", "-o", "out", "--max-frames", 1, "--outputs", "labels")
+    assert "correct of truth, labels" in text
+    (row,) = json.loads((tmp_path / "out" / "metrics.json").read_text())["frames"]
+    assert row["truth"]["labels"]["truth_regions"] > 5
+    assert row["truth"]["labels"]["voi_bits"] < 3
+
+
+def test_inspect_lists_frames_and_regions(rcseg, tmp_path):
+    write_folder(tmp_path / "in", depth_entries(2))
+    rcseg("replay", "in", "-o", "out")
+    text = rcseg("inspect", "out")
+    assert "/rcseg/regions" in text and "rcseg_msgs/msg/RegionArray" in text and "1700000000.100" in text
+    regions = len(segment(scene(1), SegmenterConfig()).regions)
+    assert f"frame 1: {regions} regions" in rcseg("inspect", "out", "--frame", 1)
+
+
+def check_results(folder, frame):
+    expected = segment(frame, SegmenterConfig())
+    labels = cv2.imread(str(folder / "labels.png"), cv2.IMREAD_UNCHANGED)
+    assert labels.dtype == np.uint16
+    np.testing.assert_array_equal(labels, expected.labels)
+    surfaces = cv2.imread(str(folder / "surface_labels.png"), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(surfaces, expected.surface_labels)
+    assert cv2.imread(str(folder / "overlay.png")).shape == (*labels.shape, 3)
+    document = json.loads((folder / "regions.json").read_text())
+    assert [r["label"] for r in document["regions"]] == [r.label for r in expected.regions]
+    first, region = document["regions"][0], expected.regions[0]
+    assert first["pixel_count"] == (labels == 1).sum()
+    np.testing.assert_array_equal(first["range_patch"]["control_points"], region.range_patch.control_points)
+    np.testing.assert_array_equal(document["camera_matrix"], CAMERA.matrix())
+
+
+def test_segment_of_an_archive(rcseg, tmp_path):
+    frame = scene(0)
+    np.savez(tmp_path / "frame.npz", points=frame.points, color=frame.color, K=CAMERA.matrix())
+    assert "written to frame_rcseg" in rcseg("segment", "frame.npz")
+    check_results(tmp_path / "frame_rcseg", frame)
+
+
+def test_segment_of_pictures(rcseg, tmp_path):
+    frame = scene(0)
+    stored = np.nan_to_num(frame.depth_m * 5000).round().astype(np.uint16)
+    cv2.imwrite(str(tmp_path / "d.png"), stored)
+    cv2.imwrite(str(tmp_path / "c.png"), frame.color[..., ::-1])
+    intrinsics = f"{CAMERA.fx},{CAMERA.fy},{CAMERA.cx},{CAMERA.cy}"
+    images = ("--color", "c.png", "--depth", "d.png", "--intrinsics", intrinsics)
+    rcseg("segment", *images, "--depth-unit", 0.0002, "-o", "out")
+    same = type(frame).from_depth(stored.astype(np.float32) * np.float32(0.0002), frame.color, CAMERA)
+    check_results(tmp_path / "out", same)
+
+
+def test_config_shows_every_parameter_and_returns_from_its_own_file(rcseg, tmp_path):
+    changed = SegmenterConfig().replace({"grouping.range_tolerance": 0.01, "absorption.enabled": False})
+    settings = ("--set", "grouping.range_tolerance=0.01", "--set", "absorption.enabled=no")
+    text = rcseg("config", *settings).replace("\n", "")
+    for parameter in describe(changed):
+        assert parameter.key in text
+    rcseg("config", *settings, "--yaml", "my.yaml")
+    assert SegmenterConfig.from_dict(yaml.safe_load((tmp_path / "my.yaml").read_text())) == changed
+    assert rcseg("config", "--config", "my.yaml", "--yaml", "-") == (tmp_path / "my.yaml").read_text()
+
+
+def test_a_ros_parameter_file_is_a_configuration_too(rcseg, tmp_path):
+    text = "/**:\n  ros__parameters:\n    autostart: true\n    sync: {queue: 3}\n    grouping: {max_gap: 2}\n"
+    (tmp_path / "ros.yaml").write_text(text)
+    printed = yaml.safe_load(rcseg("config", "--config", "ros.yaml", "--yaml", "-"))
+    assert SegmenterConfig.from_dict(printed) == SegmenterConfig().replace({"grouping.max_gap": 2})
+
+
+def test_help_names_every_command_and_loads_no_algorithm():
+    program = "import sys; from rcseg_ros.cli import main; main(['--help']); print('numba' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    for command in ("replay", "segment", "evaluate", "config", "inspect"):
+        assert command in done.stdout
+    assert done.stdout.strip().endswith("False")
+
+
+@pytest.mark.parametrize("command", ["replay", "segment", "config", "inspect"])
+def test_each_command_explains_itself_with_an_example(rcseg, command):
+    text = rcseg(command, "--help")
+    assert "Example" in text and f"rcseg {command}" in text
