@@ -49,6 +49,6 @@ $(VENV)/.tools: $(VENV)/.installed
 # rclpy and Fast DDS from wheels, and our messages built against them: no ROS on the machine is needed.
 $(VENV)/.ros: $(VENV)/.tools $(wildcard rcseg_msgs/msg/*.msg rcseg_msgs/CMakeLists.txt rcseg_msgs/setup.py)
 	@echo "Installing rclpy and building the messages into $(VENV) (about two minutes, once)"
-	@$(PIP) --editable '.[ros]'
+	@$(PIP) --editable '.[ros,colcon]'
 	@$(PIP) ./rcseg_msgs
 	@touch $@

@@ -47,6 +47,24 @@ setup(
         "test": ["pytest>=8.0", "hypothesis>=6.90", "mcap-ros2-support>=0.5", "imgviz>=2.0"],
         "dev": ["ruff>=0.6", "mypy>=1.10", "import-linter>=2.0", "codespell>=2.2", "pre-commit>=3.5"],
         "ros": ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"],
+        # What `colcon build` needs of a ROS installation, as wheels: only to test that build.
+        "colcon": [
+            "catkin_pkg",
+            "cmake>=3.20,<4",
+            "colcon-common-extensions>=0.3",
+            "colcon-defaults>=0.2.7",
+            "ninja",
+            *(
+                f"ros-jazzy-{name}"
+                for name in (
+                    *("ament-cmake", "ament-cmake-gmock", "ament-cmake-gtest", "ament-cmake-include-directories"),
+                    *("ament-cmake-pytest", "ament-cmake-ros", "ament-package", "domain-coordinator"),
+                    *("fastrtps-cmake-module", "gmock-vendor", "gtest-vendor", "python-cmake-module"),
+                    *("rosidl-core-generators", "rosidl-default-generators"),
+                    *("rosidl-typesupport-fastrtps-c", "rosidl-typesupport-fastrtps-cpp"),
+                )
+            ),
+        ],
     },
     entry_points={
         "console_scripts": [

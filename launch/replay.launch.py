@@ -24,9 +24,7 @@ def generate_launch_description() -> LaunchDescription:
     arguments = [
         DeclareLaunchArgument("bag", description="rosbag2 folder or .mcap file"),
         DeclareLaunchArgument("rate", default_value="1.0", description="playing speed"),
-        DeclareLaunchArgument(
-            "delay", default_value="5", description="seconds until it plays; 60 for a first run"
-        ),
+        DeclareLaunchArgument("delay", default_value="5", description="seconds before it plays"),
         DeclareLaunchArgument("loop", default_value="false", description="play again and again"),
         DeclareLaunchArgument("rviz", default_value="true", description="show the results in RViz"),
         DeclareLaunchArgument(
@@ -47,7 +45,7 @@ def generate_launch_description() -> LaunchDescription:
             **{topic: LaunchConfiguration(topic) for topic in PASSED_ON},
         }.items(),
     )
-    # A node that has run before configures within the delay; one that compiles for the first time takes a minute.
+    # A node that has run before configures within the delay; to compile for the first time takes 60 s.
     play = ["ros2", "bag", "play", LaunchConfiguration("bag"), "--clock"]
     play += ["--delay", LaunchConfiguration("delay"), "--rate", LaunchConfiguration("rate")]
     looped = LaunchConfiguration("loop")
