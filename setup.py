@@ -6,6 +6,12 @@ from pathlib import Path
 from setuptools import find_packages, setup
 
 ROS_PACKAGE = "rcseg_ros"
+GENERATORS = """
+    ament-cmake ament-cmake-gmock ament-cmake-gtest ament-cmake-include-directories ament-cmake-pytest
+    ament-cmake-ros ament-package domain-coordinator fastrtps-cmake-module gmock-vendor gtest-vendor
+    python-cmake-module rosidl-core-generators rosidl-default-generators rosidl-typesupport-fastrtps-c
+    rosidl-typesupport-fastrtps-cpp
+""".split()
 
 setup(
     name="rcseg",
@@ -54,16 +60,7 @@ setup(
             "colcon-common-extensions>=0.3",
             "colcon-defaults>=0.2.7",
             "ninja",
-            *(
-                f"ros-jazzy-{name}"
-                for name in (
-                    *("ament-cmake", "ament-cmake-gmock", "ament-cmake-gtest", "ament-cmake-include-directories"),
-                    *("ament-cmake-pytest", "ament-cmake-ros", "ament-package", "domain-coordinator"),
-                    *("fastrtps-cmake-module", "gmock-vendor", "gtest-vendor", "python-cmake-module"),
-                    *("rosidl-core-generators", "rosidl-default-generators"),
-                    *("rosidl-typesupport-fastrtps-c", "rosidl-typesupport-fastrtps-cpp"),
-                )
-            ),
+            *(f"ros-jazzy-{name}" for name in GENERATORS),
         ],
     },
     entry_points={
