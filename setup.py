@@ -6,12 +6,24 @@ from pathlib import Path
 from setuptools import find_packages, setup
 
 ROS_PACKAGE = "rcseg_ros"
-GENERATORS = """
-    ament-cmake ament-cmake-gmock ament-cmake-gtest ament-cmake-include-directories ament-cmake-pytest
-    ament-cmake-ros ament-package domain-coordinator fastrtps-cmake-module gmock-vendor gtest-vendor
-    python-cmake-module rosidl-core-generators rosidl-default-generators rosidl-typesupport-fastrtps-c
-    rosidl-typesupport-fastrtps-cpp
-""".split()
+GENERATORS = [
+    "ament-cmake",
+    "ament-cmake-gmock",
+    "ament-cmake-gtest",
+    "ament-cmake-include-directories",
+    "ament-cmake-pytest",
+    "ament-cmake-ros",
+    "ament-package",
+    "domain-coordinator",
+    "fastrtps-cmake-module",
+    "gmock-vendor",
+    "gtest-vendor",
+    "python-cmake-module",
+    "rosidl-core-generators",
+    "rosidl-default-generators",
+    "rosidl-typesupport-fastrtps-c",
+    "rosidl-typesupport-fastrtps-cpp",
+]
 
 setup(
     name="rcseg",
