@@ -70,19 +70,17 @@ def distinct_colors(
     InputError
         When so many distinct colours do not fit.
     """
-    found = [] if avoid is None else [np.asarray(c, float) for c in np.atleast_2d(avoid)]
+    found = np.empty((0, 3)) if avoid is None else np.atleast_2d(avoid)
     given = len(found)
-    for _ in range(1000 * (count + 1)):
+    for _ in range(5000):
         if len(found) == given + count:
-            break
+            return found[given:]
         color = rng.uniform(low, high, 3)
-        if all(np.max(np.abs(color - other)) >= LEAST_DIFFERENCE for other in found):
-            found.append(color)
-    else:
-        raise InputError(
-            f"distinct_colors: {count} colours {LEAST_DIFFERENCE:g} levels apart do not fit; ask for fewer"
-        )
-    return np.array(found[given:]).reshape(count, 3)
+        if (np.abs(found - color).max(axis=1) >= LEAST_DIFFERENCE).all():
+            found = np.vstack([found, color])
+    raise InputError(
+        f"distinct_colors: {count} colours {LEAST_DIFFERENCE:g} levels apart do not fit; ask for fewer"
+    )
 
 
 def rectangle(center: tuple[float, float], half: tuple[float, float], angle: float = 0.0) -> Mask:

@@ -1,0 +1,171 @@
+"""The runner behind `rcseg evaluate`: files, tables, pictures, bad options, interruption."""
+
+import csv
+import json
+
+import cv2
+import numpy as np
+import pytest
+from rich.console import Console
+
+import rcseg_ros.evaluate as evaluate
+from rcseg_core import SegmenterConfig
+from rcseg_core.errors import InputError
+from rcseg_core.synthetic import FAMILIES, make_scene
+from rcseg_ros.evaluate import SyntheticOptions, parse_families, parse_seeds, parse_size, run_evaluate
+
+SMALL = SyntheticOptions(families=("room", "painting"), seeds=(0, 1), width=160, height=120)
+
+
+@pytest.fixture
+def console(tmp_path):
+    with (tmp_path / "screen.txt").open("w", encoding="utf-8") as file:
+        yield Console(file=file)
+
+
+def screen(tmp_path):
+    return (tmp_path / "screen.txt").read_text("utf-8")
+
+
+def test_a_run_writes_figures_plot_and_pictures(tmp_path, console):
+    output = tmp_path / "out"
+    report = run_evaluate(
+        "synthetic", config=SegmenterConfig(), console=console, output=output, synthetic=SMALL
+    )
+    document = json.loads((output / "metrics.json").read_text())
+    assert [row["frame"] for row in document["frames"]] == [
+        "room_000",
+        "room_001",
+        "painting_000",
+        "painting_001",
+    ]
+    for group, row in zip(report.pooled, document["pooled"], strict=True):
+        frames = [f for f in document["frames"] if f["frame"].startswith(group.name)]
+        assert row["correct"] == sum(f["correct"] for f in frames)
+        assert row["correct_share"] == row["correct"] / sum(f["truth_regions"] for f in frames)
+        assert row["depth_error_sigmas"] == pytest.approx(np.mean([f["depth_error_sigmas"] for f in frames]))
+    assert document["settings"]["synthetic"]["seeds"] == [0, 1]
+    assert document["config"] == json.loads(json.dumps(SegmenterConfig().to_dict()))
+    assert set(document["correct_over_tolerance"]["room"]) >= {"0.51", "0.8", "0.95"}
+    with (output / "frames.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [int(r["correct"]) for r in rows] == [f["correct"] for f in document["frames"]]
+    assert cv2.imread(str(output / "correct.png")).shape[2] == 3
+    assert sorted(p.name for p in (output / "pictures").iterdir()) == [
+        "painting_000.png",
+        "painting_001.png",
+        "room_000.png",
+        "room_001.png",
+    ]
+    console.file.flush()
+    text = screen(tmp_path)
+    assert "Pooled, overlap 0.8" in text
+    assert f"{report.pooled[0].correct():.3f}" in text
+
+
+def test_recorded_frames_of_each_kind_of_truth(tmp_path, console):
+    scene = make_scene("room", 1, width=160, height=120)
+    data = tmp_path / "data"
+    (data / "objects").mkdir(parents=True)
+    camera = scene.frame.camera
+    meta = {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy, "background_labels": [1]}
+    (data / "objects" / "meta.json").write_text(json.dumps(meta))
+    depth = np.round(1000 * np.nan_to_num(scene.frame.depth_m)).astype(np.uint16)
+    cv2.imwrite(str(data / "objects" / "depth.png"), depth)
+    cv2.imwrite(str(data / "objects" / "rgb.png"), scene.frame.color[..., ::-1])
+    cv2.imwrite(str(data / "objects" / "labels.png"), scene.object_labels.astype(np.uint8))
+    np.savez(
+        data / "planes.npz", points=scene.frame.points, color=scene.frame.color, labels=scene.surface_labels
+    )
+    np.savez(data / "alone.npz", points=scene.frame.points, color=scene.frame.color)
+    output = tmp_path / "out"
+    report = run_evaluate(
+        str(data), config=SegmenterConfig(), console=console, output=output, level="surfaces"
+    )
+    assert dict(zip((f.name for f in report.frames), report.groups, strict=True)) == {
+        "alone": "without truth",
+        "objects": "objects",
+        "planes": "regions",
+    }
+    alone, objects, planes = report.frames
+    assert alone.labels is None and alone.parts is None
+    assert 0.5 < objects.parts.purity <= 1
+    assert planes.labels.truth_regions > 3
+    assert len(list((output / "pictures").iterdir())) == 3
+    only = run_evaluate(str(data), config=SegmenterConfig(), console=console, match="pla*", pictures=False)
+    assert [f.name for f in only.frames] == ["planes"]
+
+
+def test_an_interrupted_run_keeps_what_was_finished(tmp_path, console, monkeypatch):
+    real, calls = evaluate.segment, []
+
+    def interrupt(frame, config):
+        calls.append(frame)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return real(frame, config)
+
+    monkeypatch.setattr(evaluate, "segment", interrupt)
+    output = tmp_path / "out"
+    with pytest.raises(KeyboardInterrupt):
+        run_evaluate("synthetic", config=SegmenterConfig(), console=console, output=output, synthetic=SMALL)
+    document = json.loads((output / "metrics.json").read_text())
+    assert [row["frame"] for row in document["frames"]] == ["room_000", "room_001"]
+
+
+def test_a_run_that_fails_at_once_leaves_nothing(tmp_path, console, monkeypatch):
+    def fail(frame, config):
+        raise RuntimeError("broken")
+
+    monkeypatch.setattr(evaluate, "segment", fail)
+    with pytest.raises(RuntimeError, match="broken"):
+        run_evaluate(
+            "synthetic", config=SegmenterConfig(), console=console, output=tmp_path / "out", synthetic=SMALL
+        )
+    assert [p.name for p in tmp_path.iterdir()] == ["screen.txt"]
+
+
+@pytest.mark.parametrize(
+    ("text", "seeds"), [("7", (7,)), ("100-102", (100, 101, 102)), ("1, 5,4-6", (1, 5, 4, 6))]
+)
+def test_seeds_are_numbers_and_ranges(text, seeds):
+    assert parse_seeds(text) == seeds
+
+
+@pytest.mark.parametrize("text", ["", "x", "5-", "-5", "9-3", "1;2"])
+def test_bad_seeds_are_one_clear_line(text):
+    with pytest.raises(InputError, match="--seeds"):
+        parse_seeds(text)
+
+
+def test_families_sizes_and_levels():
+    assert parse_families("all") == FAMILIES
+    assert parse_families("all", structured_light=True) == ("room", "blocks", "curved")
+    assert parse_families("room, blocks") == ("room", "blocks")
+    assert parse_size("320x240") == (320, 240)
+    with pytest.raises(InputError, match="'kitchen' is none of"):
+        parse_families("kitchen")
+    for text in ("640", "x", "640x", "-1x5"):
+        with pytest.raises(InputError, match="--size"):
+            parse_size(text)
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"dataset": "/nowhere"}, "no such file"),
+        ({"level": "faces"}, "--labels faces"),
+        ({"tolerance": 0.5}, "--tolerance 0.5"),
+    ],
+)
+def test_bad_options_are_refused_before_anything_is_written(tmp_path, console, options, text):
+    arguments = {"dataset": "synthetic", "synthetic": SMALL, **options}
+    with pytest.raises(InputError, match=text):
+        run_evaluate(
+            arguments.pop("dataset"),
+            config=SegmenterConfig(),
+            console=console,
+            output=tmp_path / "out",
+            **arguments,
+        )
+    assert [p.name for p in tmp_path.iterdir()] == ["screen.txt"]
