@@ -55,22 +55,23 @@ def run_replay(request: ReplayRequest) -> int:
     if summary.interrupted:
         raise KeyboardInterrupt
     if summary.damage:
-        raise InputError(
-            f"{'; '.join(summary.damage)}; {len(summary.frames)} frames before it are in {request.output}"
-        )
+        saved = f"{_count(len(summary.frames), 'frame')} before it written to {request.output}"
+        raise InputError(f"{'; '.join(summary.damage)}; {saved}")
     return 0
 
 
 def _summary_table(summary: ReplaySummary) -> Table:
-    table = Table(title=f"{len(summary.frames)} frames", title_justify="left")
-    for name in ("", "median", "least", "most"):
-        table.add_column(name, justify="left" if not name else "right")
     frames = summary.frames
+    table = Table(title=_count(len(frames), "frame"), title_justify="left")
+    columns = {"median": median, "least": min, "most": max} if len(frames) > 1 else {"": max}
+    table.add_column("")
+    for name in columns:
+        table.add_column(name, justify="right")
 
-    def row(name: str, values: Iterable[float], form: str) -> None:
+    def row(name: str, values: Iterable[float | None], form: str) -> None:
         known = [value for value in values if value is not None]
         if known:
-            table.add_row(name, *(form.format(f(known)) for f in (median, min, max)))
+            table.add_row(name, *(form.format(summarize(known)) for summarize in columns.values()))
 
     row("regions", (f["regions"] for f in frames), "{:.0f}")
     row("surfaces", (f["surfaces"] for f in frames), "{:.0f}")
@@ -122,6 +123,10 @@ def print_config(config: SegmenterConfig) -> None:
         cells = (value, _text(parameter.default), bounds(parameter), parameter.symbol, parameter.doc)
         table.add_row(parameter.key, *cells)
     CONSOLE.print(table)
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
 def _text(value: Any) -> str:

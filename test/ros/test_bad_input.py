@@ -79,7 +79,7 @@ def test_truncated_recording_frames_before_the_damage_are_processed(refused, com
     path = write_mcap(tmp_path / "cut.mcap", depth_entries(6), compression)
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     error = refused("replay", path, "-o", "out", left=["out"])
-    assert "cut.mcap" in error and "frames before it are in out" in error
+    assert "cut.mcap" in error and "before it written to out" in error
     with Recording(tmp_path / "work" / "out") as result:
         assert 1 <= result.topics["/rcseg/labels"].count < 6
         assert result.damage == []
@@ -90,7 +90,7 @@ def test_corrupt_recording_frames_before_the_damage_are_processed(refused, tmp_p
     data = bytearray(path.read_bytes())
     data[len(data) // 2 : len(data) // 2 + 64] = bytes(64)
     path.write_bytes(data)
-    assert "frames before it are in out" in refused("replay", path, "-o", "out", left=["out"])
+    assert "before it written to out" in refused("replay", path, "-o", "out", left=["out"])
     with Recording(tmp_path / "work" / "out") as result:
         assert 1 <= result.topics["/rcseg/labels"].count < 6
 
