@@ -22,7 +22,7 @@ IMPULSE_SHARE = 0.5
 
 
 @kernel
-def _grow(image, flags, labels, leaves, models, n_range, law, color_eps2, max_cost):  # type: ignore[no-untyped-def]
+def _grow(image, flags, labels, leaves, within, models, n_range, law, color_eps2, max_cost):  # type: ignore[no-untyped-def]
     """Best-first growth: each bucket is a linked list of (pixel, region) offers, cheapest bucket first."""
     height, width = labels.shape
     first = np.full(BUCKETS, -1, np.int64)
@@ -72,7 +72,7 @@ def _grow(image, flags, labels, leaves, models, n_range, law, color_eps2, max_co
             c = col + (d == 3) - (d == 2)
             if r < 0 or c < 0 or r >= height or c >= width:
                 continue
-            if labels[r, c] != 0 or flags[r, c] & INVALID != 0:
+            if labels[r, c] != 0 or flags[r, c] & INVALID != 0 or within[r, c] != within[row, col]:
                 continue
             cost = pixel_cost(models, k, image, flags, r, c, n_range, law, color_eps2)
             if flags[r, c] & (RANGE_OUTLIER | COLOR_OUTLIER) != 0:
@@ -102,7 +102,7 @@ def _grow(image, flags, labels, leaves, models, n_range, law, color_eps2, max_co
 
 
 @kernel
-def _refine(image, flags, labels, leaves, models, n_range, law, color_eps2, smoothness):  # type: ignore[no-untyped-def]
+def _refine(image, flags, labels, leaves, within, models, n_range, law, color_eps2, smoothness):  # type: ignore[no-untyped-def]
     """One raster pass: each boundary pixel takes the label with the least cost plus smoothness per other neighbour.
 
     Returns the number of pixels that changed.
@@ -134,7 +134,7 @@ def _refine(image, flags, labels, leaves, models, n_range, law, color_eps2, smoo
                     if r < 0 or c < 0 or r >= height or c >= width:
                         continue
                 m = labels[r, c]
-                if m <= 0 or (candidate < 4 and m == k):
+                if m <= 0 or (candidate < 4 and m == k) or within[r, c] != within[row, col]:
                     continue
                 cost = pixel_cost(models, m, image, flags, row, col, n_range, law, color_eps2)
                 for i in range(-1, 2):
@@ -154,11 +154,19 @@ def _refine(image, flags, labels, leaves, models, n_range, law, color_eps2, smoo
     return moved
 
 
-def absorb(signals: Signals, labels: NDArray[np.int32], leaves: NDArray[np.int32], models: Models, max_cost: float) -> None:
-    """Grow regions over unassigned measured pixels, best first, in place; invalid pixels stay 0."""
+def absorb(
+    signals: Signals, labels: NDArray[np.int32], leaves: NDArray[np.int32], models: Models, max_cost: float,
+    within: NDArray[np.int32] | None = None,
+) -> None:  # fmt: skip
+    """Grow regions over unassigned measured pixels, best first, in place; invalid pixels stay 0.
+
+    within : (H, W) int32, optional; growth never crosses from one value of it to another
+    """
+    if within is None:
+        within = np.zeros_like(labels)
     _grow(
-        signals.image, signals.flags, labels, leaves, models, signals.n_range, signals.law, signals.color_eps2,
-        max_cost,
+        signals.image, signals.flags, labels, leaves, within, models, signals.n_range, signals.law,
+        signals.color_eps2, max_cost,
     )  # fmt: skip
 
 
@@ -166,11 +174,16 @@ def absorb(signals: Signals, labels: NDArray[np.int32], leaves: NDArray[np.int32
 SMOOTHNESS = 0.5
 
 
-def refine(signals: Signals, labels: NDArray[np.int32], leaves: NDArray[np.int32], models: Models, passes: int) -> None:
-    """Let boundary pixels move to the adjacent region that predicts them better, in place."""
+def refine(
+    signals: Signals, labels: NDArray[np.int32], leaves: NDArray[np.int32], models: Models, passes: int,
+    within: NDArray[np.int32] | None = None,
+) -> None:  # fmt: skip
+    """Let boundary pixels move to the adjacent region that predicts them better, in place; `within` as in absorb."""
+    if within is None:
+        within = np.zeros_like(labels)
     for _ in range(passes):
         moved = _refine(
-            signals.image, signals.flags, labels, leaves, models, signals.n_range, signals.law,
+            signals.image, signals.flags, labels, leaves, within, models, signals.n_range, signals.law,
             signals.color_eps2, SMOOTHNESS,
         )  # fmt: skip
         if moved == 0:

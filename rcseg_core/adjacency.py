@@ -95,12 +95,16 @@ def touching(cells, met, keys, bits, count):  # type: ignore[no-untyped-def]
     return n
 
 
-def find_pairs(labels: NDArray[np.int32], count: int, edges: NDArray[np.uint8], max_gap: int) -> Pairs:
+def find_pairs(
+    labels: NDArray[np.int32], count: int, edges: NDArray[np.uint8], max_gap: int,
+    group: NDArray[np.int64] | None = None,
+) -> Pairs:  # fmt: skip
     """Adjacent pairs of regions 1..count at most `max_gap` pixels apart.
 
     Parameters
     ----------
     labels : (H, W) int32; edges : (H, W) uint8 bit mask (depth 1, orientation 2, colour 4)
+    group : (count + 1,) int64, optional; only pairs of one group are listed
     """
     cells, met = np.empty_like(labels), np.empty(labels.shape, np.uint8)
     spread(labels, edges, (max_gap + 1) // 2, cells, met)
@@ -110,9 +114,13 @@ def find_pairs(labels: NDArray[np.int32], count: int, edges: NDArray[np.uint8], 
     keys, inverse = np.unique(keys[:n], return_inverse=True)
     bits = bits[:n]
     size = keys.size
-    return Pairs(
+    pairs = Pairs(
         np.stack([keys // (count + 1), keys % (count + 1)], 1),
         np.bincount(inverse, minlength=size).astype(np.float64),
         np.bincount(inverse, (bits & 3) != 0, minlength=size).astype(np.float64),
         np.bincount(inverse, (bits & 4) != 0, minlength=size).astype(np.float64),
     )
+    if group is None:
+        return pairs
+    same = group[pairs.nodes[:, 0]] == group[pairs.nodes[:, 1]]
+    return Pairs(*(a[same] for a in pairs))

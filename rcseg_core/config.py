@@ -143,6 +143,12 @@ class SeedsConfig:
 class GroupingConfig:
     """Best-first grouping of adjacent regions (section 6, eq. 16-21)."""
 
+    order: Literal["surfaces_first", "joint", "range_only"] = _param(
+        "surfaces_first",
+        "surfaces_first: surfaces from range alone, then the colour regions on each; joint: both signals at once "
+        "(the paper); range_only: surfaces, whatever their colour",
+        choices=("surfaces_first", "joint", "range_only"),
+    )
     criterion: Literal["bounded", "chow", "bayes"] = _param(
         "bounded",
         "bounded: the joint model must explain both sides; chow: total rise of the residual; bayes: c_ib of eq. (21)",
@@ -292,6 +298,7 @@ class SegmenterConfig:
         return cls().replace(
             {
                 "signal.kind": "xyz",
+                "grouping.order": "joint",
                 "seeds.fit": "lms",
                 "grouping.criterion": "bayes",
                 "grouping.edge_gate": False,

@@ -18,6 +18,7 @@ from rcseg_core.config import EdgesConfig
 from rcseg_core.signals import INVALID, Signals
 
 DEPTH, ORIENTATION, COLOR = 1, 2, 4
+RANGE_EDGES = np.uint8(DEPTH | ORIENTATION)
 
 #: Box that smooths the range before creases are looked for, and how far it lowers white noise in the Laplacian.
 SMOOTH_PX = 5

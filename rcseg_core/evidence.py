@@ -16,10 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rcseg_core.jit import kernel
-from rcseg_core.moments import UNIT_PX, Moments, residual, shift_grid, solve
+from rcseg_core.moments import UNIT_PX, Moments, mean_square_gradient, residual, shift_grid, solve
 from rcseg_core.signals import local_scales
 
 BOUNDED, CHOW, BAYES = 0, 1, 2
+#: Steeper than this (tan^2) a surface is hardly measured: the tolerance along the ray grows no further.
+MAX_TAN2 = 8.0
 KINDS = {"bounded": BOUNDED, "chow": CHOW, "bayes": BAYES}
 
 
@@ -28,7 +30,8 @@ class Rule(NamedTuple):
 
     kind : BOUNDED, CHOW or BAYES; n_range, channels : int; law, color_eps2 : see Signals;
     share2 : squared noise share; relief2 : squared relief tolerance;
-    correlation : pixels an independent measurement, of range and of colour; beta2 : beta^2 of eq. (20); use_range, use_color : whether a modality counts;
+    correlation : pixels an independent measurement, of range and of colour;
+    slope : gradient (whitened, per UNIT_PX) of a surface tilted by 45 degrees, as a + b s of the signal; beta2 : beta^2 of eq. (20); use_range, use_color : whether a modality counts;
     terms : exponents of the models by degree, (p, 2) int64 each; terms[1] is a plane or the bilinear form;
     degree : (N + 1, 2) int64, degree of range and colour of each region; a pair takes the higher of the two (step 6)
     """
@@ -41,6 +44,7 @@ class Rule(NamedTuple):
     share2: float
     relief2: float
     correlation: tuple[float, float]
+    slope: tuple[float, float]
     beta2: float
     use_range: bool
     use_color: bool
@@ -101,7 +105,8 @@ def channel_span(rule, modality):  # type: ignore[no-untyped-def]
 def own_residuals(moments, k, rule, work, out):  # type: ignore[no-untyped-def]
     """Residual sums of squares of region k about its own models: out[0] range, out[1] colour.
 
-    out[2]: range about a first-degree model where the own degree is higher, else inf.
+    out[2]: range about a first-degree model where the own degree is higher, else inf; out[3]: mean of 1/cos^2 of
+    the slope of the surface, by which a distance along the ray exceeds the distance to the surface, squared.
     """
     for modality in range(2):
         first, last = channel_span(rule, modality)
@@ -110,8 +115,12 @@ def own_residuals(moments, k, rule, work, out):  # type: ignore[no-untyped-def]
         out[modality] = residual(
             moments.power[k], moments.cross[k], moments.energy[k], first, last, terms, work.coef
         )
+        if modality == 0 and rule.use_range and rule.degree[k, 0] > 1:
+            steepness = mean_square_gradient(moments.power[k], terms, work.coef[last - 1])
+            flat = rule.slope[0] + rule.slope[1] * moments.cross[k, 0, 0, 0] / max(moments.power[k, 0, 0], 1.0)
+            out[3] = 1.0 + min(steepness / (flat * flat), MAX_TAN2)
     out[2] = np.inf
-    if rule.degree[k, 0] > 1:
+    if rule.use_range and rule.degree[k, 0] > 1:
         solve(moments.power[k], moments.cross[k], 0, rule.n_range, rule.terms[1], work.gram, work.coef)
         out[2] = residual(
             moments.power[k], moments.cross[k], moments.energy[k], 0, rule.n_range, rule.terms[1], work.coef
@@ -119,16 +128,18 @@ def own_residuals(moments, k, rule, work, out):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def earned_tolerance(eps2, relief2, n, rss_flat, var):  # type: ignore[no-untyped-def]
+def earned_tolerance(eps2, relief2, n, own, var):  # type: ignore[no-untyped-def]
     """The tolerance that a side may claim in a higher-degree model, from what its first-degree model misses.
 
     The tolerance is there for shapes that no polynomial follows. A side that is flat to within the noise needs
     none: two such sides that only a bent model with tolerance could join are the two faces of a crease. A side
     with much relief may miss a share of it: a quartic follows a hemisphere to 2 % of its radius, however large.
+    The tolerance is a distance to the surface; own[3] makes it one along the ray.
     """
-    relief = max(rss_flat / n - var, 0.0)
-    if relief == np.inf:
+    if own[2] == np.inf:
         return eps2
+    relief = max(own[2] / n - var, 0.0)
+    eps2 *= own[3]
     return min(max(eps2, relief2 * relief), relief)
 
 
@@ -177,8 +188,8 @@ def _bounded(moments, big, small, rule, own, gate_r, gate_c, work):  # type: ign
         budget_big = n_big * eps2
         budget_small = n_small * eps2
         if modality == 0:
-            budget_big = n_big * earned_tolerance(eps2, rule.relief2, n_big, own[big, 2], var * rule.n_range)
-            budget_small = n_small * earned_tolerance(eps2, rule.relief2, n_small, own[small, 2], var * rule.n_range)
+            budget_big = n_big * earned_tolerance(eps2, rule.relief2, n_big, own[big], var * rule.n_range)
+            budget_small = n_small * earned_tolerance(eps2, rule.relief2, n_small, own[small], var * rule.n_range)
         if rule.kind == CHOW:
             n = n_big + n_small
             ratio, need = _excess(rise_big + rise_small, noise + n * share, budget_big + budget_small)
@@ -262,7 +273,7 @@ def _bayes(moments, big, small, rule, own, boxes, work):  # type: ignore[no-unty
 def compare(moments, i, j, rule, own, boxes, gate_r, gate_c, work):  # type: ignore[no-untyped-def]
     """Compare two regions.
 
-    own : (N, 3) residuals of each region's own models, see own_residuals; gate_r, gate_c : shares of the boundary free of edges
+    own : (N, 4) residuals of each region's own models, see own_residuals; gate_r, gate_c : shares of the boundary free of edges
 
     Returns
     -------

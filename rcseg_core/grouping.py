@@ -300,7 +300,7 @@ def group(
     count = moments.energy.shape[0] - 1
     graph = make_graph(pairs, count)
     work: Work = make_work(moments)
-    own = np.zeros((count + 1, 2))
+    own = np.ones((count + 1, 4))
     merges = np.empty((max(count, 1), 2), np.int64)
     heights = np.empty(max(count, 1))
     merged, comparisons = _run(

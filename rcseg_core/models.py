@@ -80,7 +80,7 @@ def pixel_cost(models, k, image, flags, row, col, n_range, law, color_eps2):  # 
     A modality in which the pixel is missing or an impulse says nothing.
     """
     cost = 0.0
-    if flags[row, col] & (INVALID | RANGE_OUTLIER) == 0:
+    if n_range > 0 and flags[row, col] & (INVALID | RANGE_OUTLIER) == 0:
         total = 0.0
         first = predict(models, k, row, col, 0, 0)
         var, eps2 = local_scales(law, first)

@@ -222,3 +222,23 @@ def residual(power, cross, energy, first, last, exponents, coef):  # type: ignor
             rss += coef[c, i] * row
         total += max(rss, 0.0)
     return total
+
+
+@kernel
+def mean_square_gradient(power, terms, coef):  # type: ignore[no-untyped-def]
+    """Mean over a region of |grad s|^2 per UNIT_PX^2 for one channel with coefficients coef (p,)."""
+    p = terms.shape[0]
+    total = 0.0
+    for i in range(p):
+        ai = terms[i, 0]
+        bi = terms[i, 1]
+        for j in range(p):
+            a = ai + terms[j, 0]
+            b = bi + terms[j, 1]
+            part = 0.0
+            if ai > 0 and terms[j, 0] > 0:
+                part += ai * terms[j, 0] * power[a - 2, b]
+            if bi > 0 and terms[j, 1] > 0:
+                part += bi * terms[j, 1] * power[a, b - 2]
+            total += coef[i] * coef[j] * part
+    return max(total, 0.0) / max(power[0, 0], 1.0)

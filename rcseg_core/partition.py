@@ -16,7 +16,11 @@ from rcseg_core.hierarchy import TreeBuilder
 class Partition:
     """Regions 1..count over the pixels (0 unassigned) and the tree that led to them."""
 
-    def __init__(self, seeds: NDArray[np.int32], count: int) -> None:
+    def __init__(
+        self, seeds: NDArray[np.int32], count: int, within: NDArray[np.int32] | None = None
+    ) -> None:
+        #: (H, W) int32 or None: regions never reach from one value of it to another
+        self.within = within
         self.labels = seeds
         self.leaves = seeds.copy()
         self.count = count
@@ -49,15 +53,20 @@ class Partition:
         rest = (candidates & (self.labels == 0)).astype(np.uint8)
         if not rest.any():
             return 0
-        found, parts, stats, _ = cv2.connectedComponentsWithStats(rest, connectivity=4)
-        large = stats[:, cv2.CC_STAT_AREA] >= least
-        large[0] = False
+        parts = cv2.connectedComponents(rest, connectivity=4)[1]
+        if self.within is not None:
+            keys = parts.astype(np.int64) * (int(self.within.max()) + 1) + self.within
+            keys[parts == 0] = -1
+            parts = np.unique(keys, return_inverse=True)[1].reshape(parts.shape)
+        areas = np.bincount(parts[rest > 0])
+        large = areas >= least
+        found = areas.size
         extra = int(large.sum())
         if extra == 0:
             return 0
         number = np.zeros(found, np.int32)
         number[large] = np.arange(1, extra + 1)
-        part = number[parts]
+        part = np.where(rest > 0, number[parts], 0)
         new = part > 0
         self.labels[new] = part[new] + self.count
         old_leaves = self.tree.leaf_count
@@ -81,11 +90,22 @@ class Partition:
         mapping = np.where(keep, np.cumsum(keep) - 1, 0).astype(np.int32)
         self._relabel(mapping, np.nonzero(keep)[0])
 
-    def sort_by_size(self) -> None:
-        """Number the regions from the largest down (ties by the first pixel), without gaps."""
+    def groups(self) -> NDArray[np.int64] | None:
+        """(count + 1,) value of `within` that each region lies in; None without one."""
+        if self.within is None:
+            return None
+        group = np.zeros(self.count + 1, np.int64)
+        group[self.labels.ravel()] = self.within.ravel()
+        group[0] = 0
+        return group
+
+    def sort_by_size(self) -> NDArray[np.int64]:
+        """Number the regions from the largest down (ties by number), without gaps; returns the old numbers."""
         sizes = np.bincount(self.labels.ravel(), minlength=self.count + 1)
         order = np.argsort(-sizes[1:], kind="stable") + 1
         order = order[sizes[order] > 0]
         mapping = np.zeros(self.count + 1, np.int32)
         mapping[order] = np.arange(1, order.size + 1)
-        self._relabel(mapping, np.concatenate([[0], order]))
+        order = np.concatenate([[0], order])
+        self._relabel(mapping, order)
+        return order

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rcseg_core.absorption import absorb, refine
 from rcseg_core.config import SegmenterConfig
 from rcseg_core.description import describe_regions
-from rcseg_core.edges import detect_edges
+from rcseg_core.edges import RANGE_EDGES, detect_edges
 from rcseg_core.errors import ConfigError
 from rcseg_core.frame import RangeColorFrame
 from rcseg_core.models import Models, fit_models
@@ -19,9 +19,13 @@ from rcseg_core.moments import Moments
 from rcseg_core.partition import Partition
 from rcseg_core.reflectance import normalize_reflectance
 from rcseg_core.seeds import initial_partition
-from rcseg_core.segmentation import Segmentation
+from rcseg_core.segmentation import Segmentation, compact
 from rcseg_core.signals import INVALID, Signals, build_signals
 from rcseg_core.stages import coarser_groups, final_degrees, group_pass, measure, surfaces_of
+
+
+#: Rounds of regrouping after the points are settled; two are seldom needed.
+MAX_ROUNDS = 3
 
 
 def segment(
@@ -57,31 +61,42 @@ def segment(
     signals = build_signals(frame, color, config)
     clock.lap("signals")
 
-    # 2. initial partition, bounded by depth, orientation and colour edges (section 5)
     edges = detect_edges(signals, config.edges)
     clock.lap("edges")
-    partition = Partition(*initial_partition(signals, edges, config.seeds))
-    clock.lap("seeds")
 
-    # 3-8. group the best pair first, generalise, until nothing changes (sections 6 and 7)
-    for degree in degrees(config):
-        models = group_pass(partition, signals, edges, degree, config)
-        clock.lap(f"group {degree}")
-        if config.absorption.enabled:
-            absorb_points(partition, signals, models, config)
-        clock.lap("absorb")
+    # 2-8 on the range alone give the surfaces, then on the colour of each surface its regions; or jointly
+    surfaces: Partition | None = None
+    if config.grouping.order == "joint":
+        partition = partition_by(signals, edges, config, None, clock, "joint")
+    else:
+        surfaces = partition_by(signals.range_only(), edges & RANGE_EDGES, config, None, clock, "range")
+        partition = surfaces
+        if config.grouping.order == "surfaces_first":
+            partition = partition_by(signals.color_only(), edges, config, surfaces.labels, clock, "color")
 
-    moments, models, boxes, pairs = finish(partition, signals, edges, config)
-    clock.lap("finish")
-    surface_of = surfaces_of(partition, signals, moments, boxes, pairs, config)
-    clock.lap("surfaces")
+    surface_of = partition.groups()
+    partition.within = None
+    if config.absorption.enabled:
+        models = final_models(partition, signals, config)[1]
+        refine(signals, partition.labels, partition.leaves, models, config.absorption.refine_passes)
+    order = partition.sort_by_size()
+    moments, models = final_models(partition, signals, config)
+    boxes, pairs = measure(partition, edges, config)
+    if config.grouping.order == "joint":
+        surface_of = surfaces_of(partition, signals, moments, boxes, pairs, config)
+    elif surface_of is None:
+        surface_of = np.arange(partition.count + 1)
+    else:
+        surface_of = surface_of[order]
+    surface_labels, surface_of = number_surfaces(partition, surface_of)
+    clock.lap("models")
     regions = describe_regions(
         frame, signals, partition.labels, surface_of, moments, models, boxes, pairs
     )
     clock.lap("describe")
     return Segmentation(
         labels=partition.labels,
-        surface_labels=surface_of.astype(np.int32)[partition.labels],
+        surface_labels=surface_labels,
         regions=regions,
         hierarchy=partition.tree.build(),
         edges=edges,
@@ -95,37 +110,78 @@ def segment(
     )
 
 
-def degrees(config: SegmenterConfig) -> list[int]:
+def degrees(config: SegmenterConfig, signals: Signals) -> list[int]:
     """Degrees of the grouping passes; odd ones above 1 add nothing on symmetric patches, so only the paper's
     own way (each region generalises by itself) walks through them."""
-    top = max(config.generalization.max_range_degree, config.generalization.max_color_degree)
+    top = config.generalization.max_range_degree if signals.n_range else 1
+    if signals.image.shape[2] > signals.n_range:
+        top = max(top, config.generalization.max_color_degree)
     ladder = (1, 2, 3, 4) if config.generalization.hypothesis == "region" else (1, 2, 4)
     return [k for k in ladder if k <= top]
 
 
+def partition_by(
+    signals: Signals, edges: NDArray[np.uint8], config: SegmenterConfig, within: NDArray[np.int32] | None,
+    clock: Clock, name: str,
+) -> Partition:  # fmt: skip
+    """Steps 2-8 on the channels of `signals`.
+
+    Parameters
+    ----------
+    within : (H, W) int32 or None; regions never cross from one value of it to another
+    name : prefix of the stages in `clock`
+    """
+    # 2. initial partition, bounded by the edges (section 5)
+    partition = Partition(*initial_partition(signals, edges, config.seeds, within), within)
+    clock.lap(f"{name} seeds")
+
+    # 3-8. group the best pair first, generalise, until nothing changes (sections 6 and 7)
+    for degree in degrees(config, signals):
+        models = group_pass(partition, signals, edges, degree, config)
+        clock.lap(f"{name} group {degree}")
+        if config.absorption.enabled:
+            absorb_points(partition, signals, models, config)
+        clock.lap(f"{name} absorb")
+    if config.absorption.enabled:
+        settle(partition, signals, config)
+        clock.lap(f"{name} settle")
+        # the points have moved the models: go on until no region changes
+        for _ in range(MAX_ROUNDS):
+            before = partition.count
+            group_pass(partition, signals, edges, degrees(config, signals)[-1], config)
+            clock.lap(f"{name} regroup")
+            if partition.count == before:
+                break
+    return partition
+
+
 def absorb_points(partition: Partition, signals: Signals, models: Models, config: SegmenterConfig) -> None:
     """Step 3: points join the regions that predict them; what hangs together and fits nowhere is a region."""
-    absorb(signals, partition.labels, partition.leaves, models, config.absorption.max_cost)
+    absorb(signals, partition.labels, partition.leaves, models, config.absorption.max_cost, partition.within)
     measured = signals.flags & INVALID == 0
     partition.add_leftovers(measured, scaled(config.absorption.min_region, signals.flags))
 
 
-def finish(
-    partition: Partition, signals: Signals, edges: NDArray[np.uint8], config: SegmenterConfig
-) -> tuple[Moments, Models, NDArray[np.int64], object]:
-    """Degrees by the nested tests, boundary pixels to the better side, specks to a neighbour; the final models."""
-    if config.absorption.enabled:
-        partition.drop_small(scaled(config.absorption.speck, signals.flags))
-        models = final_models(partition, signals, config)[1]
-        absorb_points(partition, signals, models, config)
-        models = final_models(partition, signals, config)[1]
-        for limit in (1e4, 1e12):  # the order still matters; the limit no longer does
-            absorb(signals, partition.labels, partition.leaves, models, limit)
-        refine(signals, partition.labels, partition.leaves, models, config.absorption.refine_passes)
-    partition.sort_by_size()
-    moments, models = final_models(partition, signals, config)
-    boxes, pairs = measure(partition, edges, config)
-    return moments, models, boxes, pairs
+def settle(partition: Partition, signals: Signals, config: SegmenterConfig) -> None:
+    """Specks dissolve into the neighbours that predict them; every measured pixel gets a region."""
+    partition.drop_small(scaled(config.absorption.speck, signals.flags))
+    absorb_points(partition, signals, final_models(partition, signals, config)[1], config)
+    models = final_models(partition, signals, config)[1]
+    for limit in (1e4, 1e12):  # the order still matters; the limit no longer does
+        absorb(signals, partition.labels, partition.leaves, models, limit, partition.within)
+    refine(signals, partition.labels, partition.leaves, models, config.absorption.refine_passes, partition.within)
+    if partition.within is not None:  # small parts of `within` that no region reached
+        partition.add_leftovers(partition.within > 0, 1)
+
+
+def number_surfaces(
+    partition: Partition, surface_of: NDArray[np.int64]
+) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+    """Surfaces numbered from the largest down: the label image, and the number of each region's surface."""
+    image = compact(surface_of[partition.labels])
+    number = np.zeros(partition.count + 1, np.int64)
+    number[partition.labels.ravel()] = image.ravel()
+    return image, number
 
 
 def final_models(

@@ -19,6 +19,8 @@ from rcseg_core.signals import Signals, local_scales
 
 #: A seed must keep this share of its usable pixels as inliers (LMS breaks down at half).
 MIN_INLIERS = 0.5
+#: Three pixels span a plane; two more tell whether it fits.
+LEAST_PIXELS = 5
 #: The residual variance of a window may exceed the noise by this factor, besides the tolerance.
 NOISE_FACTOR = 2.0
 
@@ -196,7 +198,7 @@ def _try_window(image, flags, row0, col0, size, n_range, law, eps2_c, half, cut,
                 samples[count, 2 + c] = image[row0 + i, col0 + j, c]
             use[count] = True
             count += 1
-    if count < min_valid * size * size or count < 5:
+    if count < min_valid * size * size or count < LEAST_PIXELS:
         return 0
     if not fit_plane(samples, use, count, coef):
         return 0
@@ -209,7 +211,7 @@ def _try_window(image, flags, row0, col0, size, n_range, law, eps2_c, half, cut,
         inliers = lms_inliers(
             samples, count, n_range, w_r, w_c, half, cut, subsets, state, coef, trial, res, use
         )
-        if inliers < MIN_INLIERS * count or inliers < 5:
+        if inliers < MIN_INLIERS * count or inliers < LEAST_PIXELS:
             return 0
         if not fit_plane(samples, use, count, coef):
             return 0
@@ -275,14 +277,23 @@ def place_windows(image, flags, edges, n_range, law, eps2_c, sizes, half, cut, r
     return count
 
 
+def _fence(edges: NDArray[np.uint8], within: NDArray[np.int32]) -> NDArray[np.uint8]:
+    """`edges` plus the upper left side of every border of `within`, and all that lies outside it."""
+    fence = (edges != 0) | (within <= 0)
+    fence[:-1] |= within[:-1] != within[1:]
+    fence[:, :-1] |= within[:, :-1] != within[:, 1:]
+    return fence.astype(np.uint8)
+
+
 def initial_partition(
-    signals: Signals, edges: NDArray[np.uint8], config: SeedsConfig
+    signals: Signals, edges: NDArray[np.uint8], config: SeedsConfig, within: NDArray[np.int32] | None = None
 ) -> tuple[NDArray[np.int32], int]:
     """The initial partition.
 
     Parameters
     ----------
     edges : (H, W) uint8, non-zero where no window may lie
+    within : (H, W) int32, optional; windows keep to one positive value of it
 
     Returns
     -------
@@ -290,11 +301,12 @@ def initial_partition(
     count : int
     """
     labels = np.zeros(signals.flags.shape, np.int32)
+    blocked = edges if within is None else _fence(edges, within)
     top = min(config.max_window, *(s - 1 + s % 2 for s in labels.shape))
     sizes = np.arange(top, min(config.min_window, top) - 1, -2, dtype=np.int64)
-    dims = 1 + 3 if signals.inverse_depth else signals.image.shape[2]
+    dims = signals.image.shape[2]
     count = place_windows(
-        signals.image, signals.flags, edges, signals.n_range, signals.law, signals.color_eps2, sizes,
+        signals.image, signals.flags, blocked, signals.n_range, signals.law, signals.color_eps2, sizes,
         float(chi2.ppf(0.5, dims)), float(chi2.ppf(0.975, dims)), config.fit == "lms", config.subsets,
         config.min_valid, labels,
     )  # fmt: skip

@@ -7,7 +7,7 @@ of depth, so both stay a small law of the (whitened) signal, evaluated once a re
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from rcseg_core.config import SegmenterConfig
 from rcseg_core.errors import ConfigError
 from rcseg_core.frame import RangeColorFrame
 from rcseg_core.jit import kernel
+from rcseg_core.moments import UNIT_PX
 from rcseg_core.noise import NoiseModel, estimate_noise
 
 # Flags of a pixel, a bit mask in `Signals.flags`.
@@ -36,6 +37,7 @@ class Signals:
     scale, offset : (C,) float64
     law : (6,) float64, `local_scales` reads it: variance of the whitened range noise and squared tolerances
     color_eps2 : squared colour tolerance (a distance in RGB) in sigma^2
+    slope : (a, b); a + b s is the gradient per UNIT_PX of a surface tilted by 45 degrees, at signal value s
     noise : NoiseModel
     inverse_depth : bool
     """
@@ -48,8 +50,34 @@ class Signals:
     offset: NDArray[np.float64]
     law: NDArray[np.float64]
     color_eps2: float
+    slope: tuple[float, float]
     noise: NoiseModel
     inverse_depth: bool
+
+    def range_only(self) -> Signals:
+        """The same frame without colour."""
+        n = self.n_range
+        return replace(
+            self,
+            image=np.ascontiguousarray(self.image[..., :n]),
+            cleaned=self.cleaned[..., :n],
+            flags=self.flags & (INVALID | RANGE_OUTLIER),
+            scale=self.scale[:n],
+            offset=self.offset[:n],
+        )
+
+    def color_only(self) -> Signals:
+        """The same frame without range; pixels without range stay invalid."""
+        n = self.n_range
+        return replace(
+            self,
+            image=np.ascontiguousarray(self.image[..., n:]),
+            cleaned=self.cleaned[..., n:],
+            flags=self.flags & (INVALID | COLOR_OUTLIER),
+            n_range=0,
+            scale=self.scale[n:],
+            offset=self.offset[n:],
+        )
 
 
 @kernel
@@ -103,8 +131,24 @@ def build_signals(
     cleaned[replace, n_range:] = median[replace, n_range:]
     image[~valid, :n_range] = 0
     return Signals(
-        image, cleaned, flags, n_range, scale, offset, law, float(np.sum(eps_c**2)) / 3.0, noise, inverse
-    )
+        image, cleaned, flags, n_range, scale, offset, law, float(np.sum(eps_c**2)) / 3.0,
+        _slope(frame, scale, offset, inverse), noise, inverse,
+    )  # fmt: skip
+
+
+def _slope(
+    frame: RangeColorFrame, scale: NDArray[np.float64], offset: NDArray[np.float64], inverse: bool
+) -> tuple[float, float]:
+    """Gradient of the last range channel on a surface tilted by 45 degrees, see `Signals.slope`."""
+    if inverse:
+        assert frame.camera is not None
+        # dz = dx is dw = w^2 dx, and a pixel is dx = 1 / (f w): dw = w / f a pixel
+        focal = float(np.sqrt(frame.camera.fx * frame.camera.fy))
+        return UNIT_PX / focal * float(offset[0] / scale[0]), UNIT_PX / focal
+    points = np.where(frame.valid[..., None], frame.points, np.nan)
+    steps = np.hypot(*(np.diff(points[..., c], axis=1) for c in (0, 1)))
+    pitch = float(np.nanmedian(steps)) if np.isfinite(steps).any() else 0.0
+    return max(pitch, 1e-9) * UNIT_PX / float(scale[2]), 0.0
 
 
 @kernel

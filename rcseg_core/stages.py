@@ -21,7 +21,9 @@ def measure(
 ) -> tuple[NDArray[np.int64], Pairs]:
     """Boxes and adjacent pairs of the current regions."""
     boxes = region_boxes(partition.labels, partition.count)
-    pairs = find_pairs(partition.labels, partition.count, edges, config.grouping.max_gap)
+    pairs = find_pairs(
+        partition.labels, partition.count, edges, config.grouping.max_gap, partition.groups()
+    )
     return boxes, pairs
 
 
@@ -32,19 +34,20 @@ def make_rule(
     first = plane_exponents() if planes else tensor_exponents(1)
     terms = (tensor_exponents(0), first, tensor_exponents(2), tensor_exponents(3), tensor_exponents(4))
     return Rule(
-        KINDS[config.grouping.criterion],
-        signals.n_range,
-        signals.image.shape[2],
-        signals.law,
-        signals.color_eps2,
-        config.grouping.noise_share**2,
-        config.grouping.relief_tolerance**2,
-        correlation(signals),
-        config.grouping.prior_beta**2,
-        True,
-        use_color,
-        terms,
-        degree,
+        kind=KINDS[config.grouping.criterion],
+        n_range=signals.n_range,
+        channels=signals.image.shape[2],
+        law=signals.law,
+        color_eps2=signals.color_eps2,
+        share2=config.grouping.noise_share**2,
+        relief2=config.grouping.relief_tolerance**2,
+        correlation=correlation(signals),
+        slope=signals.slope,
+        beta2=config.grouping.prior_beta**2,
+        use_range=signals.n_range > 0,
+        use_color=use_color and signals.image.shape[2] > signals.n_range,
+        terms=terms,
+        degree=degree,
     )
 
 
@@ -128,13 +131,11 @@ def surfaces_of(
     partition: Partition, signals: Signals, moments: Moments, boxes: NDArray[np.int64], pairs: Pairs,
     config: SegmenterConfig,
 ) -> NDArray[np.int64]:  # fmt: skip
-    """(N + 1,) surface of each region, 1..M: regions that one range model explains, whatever their colour."""
+    """(N + 1,) surface of each region of a joint partition: regions that one range model explains."""
     degree = np.full((partition.count + 1, 2), config.generalization.max_range_degree, np.int64)
     rule = make_rule(signals, degree, config, planes=False, use_color=False)
     grouped = group(_copy(moments), boxes.copy(), pairs, rule, config.grouping.edge_gate)
-    lowest = _groups(partition.count, grouped.merges)
-    numbers = np.unique(lowest, return_inverse=True)[1]
-    return numbers.astype(np.int64)
+    return _groups(partition.count, grouped.merges)
 
 
 def coarser_groups(
