@@ -147,7 +147,9 @@ def painting(rng: np.random.Generator) -> tuple[list[Solid], float, float]:
     )
     count, crossing = int(rng.integers(4, 8)), int(rng.integers(0, 2))
     colors = distinct_colors(rng, count + crossing + 1)
-    reach = min(half[1], 0.5 * height_m) * rng.uniform(0.9, 1.0)
+    # The outer bands run off the board, or leave a margin of it that is as wide as a brush would.
+    margin = rng.uniform(0.04, 0.08) * height_m if rng.random() < 0.5 else -0.03 * height_m
+    reach = min(half[1], 0.5 * height_m) - margin
     levels = np.linspace(-reach, reach, count + 1)
     levels[1:-1] += rng.uniform(-0.2, 0.2, count - 1) * (levels[1] - levels[0])
     edges = [_wavy(rng, level, height_m) for level in levels]
