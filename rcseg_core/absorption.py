@@ -162,6 +162,8 @@ def absorb(
 
     within : (H, W) int32, optional; growth never crosses from one value of it to another
     """
+    if not ((labels == 0) & (signals.flags & INVALID == 0)).any():
+        return
     if within is None:
         within = np.zeros_like(labels)
     _grow(

@@ -72,10 +72,15 @@ def spread(labels, edges, rounds, cells, met):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def touching(cells, met, keys, bits, count):  # type: ignore[no-untyped-def]
-    """List every 4-neighbour pixel pair of different cells as key = low * (count + 1) + high; returns how many."""
+def touching(cells, met, count, keys, tally):  # type: ignore[no-untyped-def]
+    """Count 4-neighbour pixel pairs of different cells by their two labels, in an open-addressed hash table.
+
+    keys : (size,) int64 filled with -1, size a power of two; tally : (size, 3) float64 zeros: pixel pairs, those that
+    met a range edge, those that met a colour edge. Returns the number of entries, or -1 when the table is too full.
+    """
     height, width = cells.shape
-    n = 0
+    size = keys.shape[0]
+    entries = 0
     for row in range(height):
         for col in range(width):
             a = cells[row, col]
@@ -89,10 +94,21 @@ def touching(cells, met, keys, bits, count):  # type: ignore[no-untyped-def]
                 b = cells[r, c]
                 if b <= 0 or b == a:
                     continue
-                keys[n] = np.int64(min(a, b)) * (count + 1) + max(a, b)
-                bits[n] = met[row, col] | met[r, c]
-                n += 1
-    return n
+                key = np.int64(min(a, b)) * (count + 1) + max(a, b)
+                slot = (key * 0x9E3779B1) & (size - 1)
+                while keys[slot] != key:
+                    if keys[slot] < 0:
+                        keys[slot] = key
+                        entries += 1
+                        if 2 * entries > size:
+                            return -1
+                        break
+                    slot = (slot + 1) & (size - 1)
+                bits = met[row, col] | met[r, c]
+                tally[slot, 0] += 1.0
+                tally[slot, 1] += (bits & 3) != 0
+                tally[slot, 2] += (bits & 4) != 0
+    return entries
 
 
 def find_pairs(
@@ -108,17 +124,18 @@ def find_pairs(
     """
     cells, met = np.empty_like(labels), np.empty(labels.shape, np.uint8)
     spread(labels, edges, (max_gap + 1) // 2, cells, met)
-    keys = np.empty(2 * labels.size, np.int64)
-    bits = np.empty(2 * labels.size, np.uint8)
-    n = touching(cells, met, keys, bits, count)
-    keys, inverse = np.unique(keys[:n], return_inverse=True)
-    bits = bits[:n]
-    size = keys.size
+    size = 1 << int(np.ceil(np.log2(16 * (count + 16))))
+    entries = -1
+    while entries < 0:
+        keys, tally = np.full(size, -1, np.int64), np.zeros((size, 3))
+        entries = touching(cells, met, count, keys, tally)
+        size *= 2
+    used = np.nonzero(keys >= 0)[0]
+    used = used[np.argsort(keys[used])]
+    keys = keys[used]
     pairs = Pairs(
         np.stack([keys // (count + 1), keys % (count + 1)], 1),
-        np.bincount(inverse, minlength=size).astype(np.float64),
-        np.bincount(inverse, (bits & 3) != 0, minlength=size).astype(np.float64),
-        np.bincount(inverse, (bits & 4) != 0, minlength=size).astype(np.float64),
+        *np.ascontiguousarray(tally[used].T),
     )
     if group is None:
         return pairs

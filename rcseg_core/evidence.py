@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from rcseg_core.jit import kernel
 from rcseg_core.moments import UNIT_PX, Moments, mean_square_gradient, residual, shift_grid, solve
+from rcseg_core.planes import joint_shape, joint_signal, rise
 from rcseg_core.signals import local_scales
 
 BOUNDED, CHOW, BAYES = 0, 1, 2
@@ -153,6 +154,48 @@ def _excess(rise, allowance, budget):  # type: ignore[no-untyped-def]
     if budget <= 0.0:
         return ratio, np.inf
     return ratio, np.sqrt(need / budget)
+
+
+@kernel
+def compare_planes(planes, i, j, rule, gate_r, gate_c, shape, signal):  # type: ignore[no-untyped-def]
+    """`compare` for three-term planes, from centred moments; shape (6,), signal (C, 5) scratch."""
+    joint_shape(planes, i, j, shape)
+    n_i = planes.shape[i, 0]
+    n_j = planes.shape[j, 0]
+    value = 0.0
+    height = 0.0
+    for modality in range(2):
+        if (modality == 0 and not rule.use_range) or (modality == 1 and not rule.use_color):
+            continue
+        first, last = channel_span(rule, modality)
+        rise_i = 0.0
+        rise_j = 0.0
+        for c in range(first, last):
+            joint_signal(planes, i, j, c, shape, signal[c])
+            rise_i += rise(planes, i, c, shape, signal[c])
+            rise_j += rise(planes, j, c, shape, signal[c])
+        if modality == 0:
+            var, eps2 = local_scales(rule.law, signal[0, 0])
+            eps2 *= gate_r * gate_r
+        else:
+            var = 1.0
+            eps2 = rule.color_eps2 * gate_c * gate_c
+        p = 3.0 * (last - first)
+        noise = var * rule.correlation[modality] * (p + 4.0 * np.sqrt(2.0 * p))
+        share = rule.share2 * var
+        if rule.kind == CHOW:
+            n = n_i + n_j
+            ratio, need = _excess(rise_i + rise_j, noise + n * share, n * eps2)
+            value = max(value, ratio)
+            height = max(height, need)
+        else:
+            ratio, need = _excess(rise_i, noise + n_i * share, n_i * eps2)
+            value = max(value, ratio)
+            height = max(height, need)
+            ratio, need = _excess(rise_j, noise + n_j * share, n_j * eps2)
+            value = max(value, ratio)
+            height = max(height, need)
+    return value, height, value <= 1.0
 
 
 @kernel

@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rcseg_core.adjacency import Pairs
-from rcseg_core.evidence import Rule, Work, compare, make_work, move, own_residuals
+from rcseg_core.evidence import BAYES, Rule, Work, compare, compare_planes, make_work, move, own_residuals
 from rcseg_core.jit import kernel
 from rcseg_core.moments import Moments
+from rcseg_core.planes import Planes, add_planes, center_planes
 
 #: All pairs of a region are compared again once it has grown by this; before that only those of the smaller side.
 GROWTH = 1.3
@@ -24,7 +25,8 @@ GROWTH = 1.3
 class Graph(NamedTuple):
     """Incidence lists over half-edges: half-edge 2e is edge e seen from ends[e, 0], 2e + 1 from ends[e, 1].
 
-    ends : (E, 2) int64; first, last : (N,) int64 half-edge or -1; following : (2E,) int64;
+    ends : (E, 2) int64; first, last : (N,) int64 half-edge or -1; length : (N,) int64 entries of each list, dead
+    ones included until they are met; following : (2E,) int64;
     alive : (E,) bool; version : (E,) int64; boundary, range_crossed, color_crossed : (E,) float64;
     height : (E,) float64, multiple of the approximation limit that the pair needed when last compared
     """
@@ -32,6 +34,7 @@ class Graph(NamedTuple):
     ends: NDArray[np.int64]
     first: NDArray[np.int64]
     last: NDArray[np.int64]
+    length: NDArray[np.int64]
     following: NDArray[np.int64]
     alive: NDArray[np.bool_]
     version: NDArray[np.int64]
@@ -48,6 +51,7 @@ def make_graph(pairs: Pairs, count: int) -> Graph:
         pairs.nodes.copy(),
         np.full(count + 1, -1, np.int64),
         np.full(count + 1, -1, np.int64),
+        np.zeros(count + 1, np.int64),
         np.full(2 * n, -1, np.int64),
         np.ones(n, np.bool_),
         np.zeros(n, np.int64),
@@ -74,6 +78,7 @@ def _append(graph, node, half):  # type: ignore[no-untyped-def]
         graph.following[graph.last[node]] = half
     graph.last[node] = half
     graph.following[half] = -1
+    graph.length[node] += 1
 
 
 @kernel
@@ -128,8 +133,31 @@ def _pop(heap, size):  # type: ignore[no-untyped-def]
         at = child
 
 
+class State(NamedTuple):
+    """What grouping changes, besides the graph.
+
+    moments : sums of the regions; planes : the same centred, used alone while `flat`; own : (N, 4) see
+    `own_residuals`; boxes : (N, 4); rule, work : see `evidence`; shape (6,), signal (C, 5) : scratch
+    """
+
+    flat: bool
+    moments: Moments
+    planes: Planes
+    own: NDArray[np.float64]
+    boxes: NDArray[np.int64]
+    rule: Rule
+    work: Work
+    shape: NDArray[np.float64]
+    signal: NDArray[np.float64]
+
+
 @kernel
-def _evaluate(graph, edge, moments, rule, own, boxes, gated, limit, work, heap, size):  # type: ignore[no-untyped-def]
+def _size(state, k):  # type: ignore[no-untyped-def]
+    return state.planes.shape[k, 0] if state.flat else state.moments.power[k, 0, 0]
+
+
+@kernel
+def _evaluate(graph, edge, state, gated, limit, heap, size):  # type: ignore[no-untyped-def]
     """Compare the ends of an edge; push the pair if it is allowed. Returns (heap, size)."""
     graph.version[edge] += 1
     i = graph.ends[edge, 0]
@@ -139,7 +167,14 @@ def _evaluate(graph, edge, moments, rule, own, boxes, gated, limit, work, heap, 
     if gated:
         gate_r -= graph.range_crossed[edge] / graph.boundary[edge]
         gate_c -= graph.color_crossed[edge] / graph.boundary[edge]
-    value, height, allowed = compare(moments, i, j, rule, own, boxes, gate_r, gate_c, work)
+    if state.flat:
+        value, height, allowed = compare_planes(
+            state.planes, i, j, state.rule, gate_r, gate_c, state.shape, state.signal
+        )
+    else:
+        value, height, allowed = compare(
+            state.moments, i, j, state.rule, state.own, state.boxes, gate_r, gate_c, state.work
+        )
     if allowed or height <= limit:
         graph.height[edge] = height
         heap = _push(heap, size, value, min(i, j), max(i, j), edge, graph.version[edge])
@@ -172,75 +207,100 @@ def _recenter(moments, k, box, work):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _join(keep, gone, moments, rule, boxes, own, work):  # type: ignore[no-untyped-def]
+def _join(keep, gone, state):  # type: ignore[no-untyped-def]
     """Region `keep` takes in `gone`: moments, box, the higher degree of the two, and its own residuals anew."""
-    _absorb_moments(moments, keep, gone, work)
+    boxes = state.boxes
     boxes[keep, 0] = min(boxes[keep, 0], boxes[gone, 0])
     boxes[keep, 1] = min(boxes[keep, 1], boxes[gone, 1])
     boxes[keep, 2] = max(boxes[keep, 2], boxes[gone, 2])
     boxes[keep, 3] = max(boxes[keep, 3], boxes[gone, 3])
-    _recenter(moments, keep, boxes[keep], work)
+    if state.flat:
+        add_planes(state.planes, keep, gone, state.shape, state.signal)
+        return
+    _absorb_moments(state.moments, keep, gone, state.work)
+    _recenter(state.moments, keep, boxes[keep], state.work)
+    degree = state.rule.degree
     for modality in range(2):
-        rule.degree[keep, modality] = max(rule.degree[keep, modality], rule.degree[gone, modality])
-    own_residuals(moments, keep, rule, work, own[keep])
+        degree[keep, modality] = max(degree[keep, modality], degree[gone, modality])
+    own_residuals(state.moments, keep, state.rule, state.work, state.own[keep])
 
 
 @kernel
-def _merge_edges(graph, keep, gone, seen, fresh):  # type: ignore[no-untyped-def]
-    """Give the edges of `gone` to `keep`; parallel edges become one. `fresh[edge]` marks what must be compared."""
-    # edges of keep, by neighbour
-    half = graph.first[keep]
-    graph.first[keep] = -1
+def _find_edge(graph, node, target):  # type: ignore[no-untyped-def]
+    """The living edge between two nodes, or -1; dead entries met on the way are unlinked from the list of `node`."""
+    before = np.int64(-1)
+    half = graph.first[node]
     while half >= 0:
         following = graph.following[half]
-        edge = half // 2
-        other = graph.ends[edge, 1 - half % 2]
-        if graph.alive[edge]:
-            if other == gone:
-                graph.alive[edge] = False
+        if graph.alive[half // 2]:
+            if graph.ends[half // 2, 1 - half % 2] == target:
+                return half // 2
+            before = half
+        else:
+            if before < 0:
+                graph.first[node] = following
             else:
-                seen[other] = edge
-                _append(graph, keep, half)
+                graph.following[before] = following
+            if graph.last[node] == half:
+                graph.last[node] = before
+            graph.length[node] -= 1
         half = following
+    return np.int64(-1)
+
+
+@kernel
+def _merge_edges(graph, keep, gone, fresh):  # type: ignore[no-untyped-def]
+    """Give the edges of `gone` to `keep`; parallel edges become one. Lists in `fresh` what must be compared anew.
+
+    Only the list of `gone` is walked, and for each of its neighbours the shorter of two lists: the list of a large
+    region is long. Returns how many edges are fresh.
+    """
+    count = 0
     half = graph.first[gone]
     while half >= 0:
         following = graph.following[half]
         edge = half // 2
         if graph.alive[edge]:
             other = graph.ends[edge, 1 - half % 2]
-            twin = seen[other]
-            if twin >= 0:
-                graph.boundary[twin] += graph.boundary[edge]
-                graph.range_crossed[twin] += graph.range_crossed[edge]
-                graph.color_crossed[twin] += graph.color_crossed[edge]
+            if other == keep:
                 graph.alive[edge] = False
-                fresh[twin] = True
             else:
-                graph.ends[edge, half % 2] = keep
-                _append(graph, keep, half)
-                fresh[edge] = True
+                if graph.length[other] <= graph.length[keep]:
+                    twin = _find_edge(graph, other, keep)
+                else:
+                    twin = _find_edge(graph, keep, other)
+                if twin >= 0:
+                    graph.boundary[twin] += graph.boundary[edge]
+                    graph.range_crossed[twin] += graph.range_crossed[edge]
+                    graph.color_crossed[twin] += graph.color_crossed[edge]
+                    graph.alive[edge] = False
+                    fresh[count] = twin
+                else:
+                    graph.ends[edge, half % 2] = keep
+                    _append(graph, keep, half)
+                    fresh[count] = edge
+                count += 1
         half = following
-    half = graph.first[keep]
-    while half >= 0:
-        seen[graph.ends[half // 2, 1 - half % 2]] = -1
-        half = graph.following[half]
+    graph.first[gone] = -1
+    return count
 
 
 @kernel
-def _run(graph, moments, rule, boxes, gated, limit, work, own, merges, heights):  # type: ignore[no-untyped-def]
+def _run(graph, state, gated, limit, merges, heights):  # type: ignore[no-untyped-def]
     """Best-first loop. Fills merges (kept, gone) and heights; returns how many, and the number of comparisons."""
-    count = moments.energy.shape[0] - 1
+    count = state.boxes.shape[0] - 1
     edges = graph.ends.shape[0]
+    full_at = np.empty(count + 1)
     for k in range(1, count + 1):
-        own_residuals(moments, k, rule, work, own[k])
+        full_at[k] = _size(state, k)
+        if not state.flat:
+            own_residuals(state.moments, k, state.rule, state.work, state.own[k])
     heap = np.empty((2 * edges + 16, 5))
     size = 0
     for edge in range(edges):
-        heap, size = _evaluate(graph, edge, moments, rule, own, boxes, gated, limit, work, heap, size)
+        heap, size = _evaluate(graph, edge, state, gated, limit, heap, size)
     comparisons = edges
-    seen = np.full(count + 1, -1, np.int64)
-    fresh = np.zeros(edges, np.bool_)
-    full_at = moments.power[:, 0, 0].copy()
+    fresh = np.empty(edges, np.int64)
     merged = 0
     while size > 0:
         edge = np.int64(heap[0, 3])
@@ -251,25 +311,27 @@ def _run(graph, moments, rule, boxes, gated, limit, work, own, merges, heights):
             continue
         i = graph.ends[edge, 0]
         j = graph.ends[edge, 1]
-        n_i = moments.power[i, 0, 0]
-        n_j = moments.power[j, 0, 0]
+        n_i = _size(state, i)
+        n_j = _size(state, j)
         keep, gone = (i, j) if n_i > n_j or (n_i == n_j and i < j) else (j, i)
         merges[merged, 0] = keep
         merges[merged, 1] = gone
         heights[merged] = graph.height[edge]
         merged += 1
-        _join(keep, gone, moments, rule, boxes, own, work)
-        _merge_edges(graph, keep, gone, seen, fresh)
-        everything = moments.power[keep, 0, 0] >= GROWTH * full_at[keep]
-        if everything:
-            full_at[keep] = moments.power[keep, 0, 0]
+        _join(keep, gone, state)
+        fresh_count = _merge_edges(graph, keep, gone, fresh)
+        grown = _size(state, keep)
+        if grown < GROWTH * full_at[keep]:
+            for e in fresh[:fresh_count]:
+                heap, size = _evaluate(graph, e, state, gated, limit, heap, size)
+            comparisons += fresh_count
+            continue
+        full_at[keep] = grown
         half = graph.first[keep]
         while half >= 0:
-            e = half // 2
-            if everything or fresh[e]:
-                heap, size = _evaluate(graph, e, moments, rule, own, boxes, gated, limit, work, heap, size)
+            if graph.alive[half // 2]:
+                heap, size = _evaluate(graph, half // 2, state, gated, limit, heap, size)
                 comparisons += 1
-                fresh[e] = False
             half = graph.following[half]
     return merged, comparisons
 
@@ -289,21 +351,35 @@ def group(
 
     Parameters
     ----------
-    moments : sums of regions 1..N, changed in place: a kept region holds the sums of all it took in
-    boxes : (N + 1, 4) int64, and rule.degree, changed in place likewise
+    moments : sums of regions 1..N; changed in place, except in a pass of planes, where they are only read
+    boxes : (N + 1, 4) int64, and rule.degree, changed in place
     limit : pairs whose height is at most this are allowed as well; above 1 for the coarser levels of the tree
 
     Returns
     -------
     Grouped
     """
-    count = moments.energy.shape[0] - 1
-    graph = make_graph(pairs, count)
-    work: Work = make_work(moments)
-    own = np.ones((count + 1, 4))
-    merges = np.empty((max(count, 1), 2), np.int64)
-    heights = np.empty(max(count, 1))
+    count, channels = moments.energy.shape
+    flat = rule.kind != BAYES and len(rule.terms[1]) == 3 and not (rule.degree[1:] > 1).any()
+    planes = center_planes(moments) if flat else Planes(np.empty((0, 6)), np.empty((0, channels, 5)))
+    state = State(
+        flat, moments, planes, np.ones((count, 4)), boxes, rule, make_work(moments), np.empty(6),
+        np.empty((channels, 5)),
+    )  # fmt: skip
+    merges = np.empty((count, 2), np.int64)
+    heights = np.empty(count)
     merged, comparisons = _run(
-        graph, moments, rule, boxes, gated, 0.0 if limit <= 1.0 else limit, work, own, merges, heights
+        make_graph(pairs, count - 1), state, gated, 0.0 if limit <= 1.0 else limit, merges, heights
     )
     return Grouped(merges[:merged], heights[:merged], int(comparisons))
+
+
+@kernel
+def _add_merged(moments, merges, work):  # type: ignore[no-untyped-def]
+    for t in range(merges.shape[0]):
+        _absorb_moments(moments, merges[t, 0], merges[t, 1], work)
+
+
+def add_merged(moments: Moments, merges: NDArray[np.int64]) -> None:
+    """Carry the merges of a pass of planes over to the power sums, in place."""
+    _add_merged(moments, merges, make_work(moments))

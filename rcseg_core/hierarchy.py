@@ -71,8 +71,8 @@ class TreeBuilder:
 
     def merge(self, a: int, b: int, height: float) -> int:
         """Join two roots; returns the new node."""
-        self._children.append((a, b))
         self._heights.append(max(height, self.node_height(a), self.node_height(b)))
+        self._children.append((a, b))
         return self.leaf_count + len(self._children)
 
     def build(self) -> Hierarchy:

@@ -30,12 +30,10 @@ class Partition:
 
     def apply(self, grouped: Grouped) -> NDArray[np.int64]:
         """Carry out the merges: relabel and record them. Returns the old label of each new region, (count + 1,)."""
+        for (keep, gone), height in zip(grouped.merges.tolist(), grouped.heights.tolist()):
+            self.nodes[keep] = self.tree.merge(int(self.nodes[keep]), int(self.nodes[gone]), height)
         target = np.arange(self.count + 1)
-        for (keep, gone), height in zip(grouped.merges, grouped.heights):
-            self.nodes[keep] = self.tree.merge(int(self.nodes[keep]), int(self.nodes[gone]), float(height))
-            target[gone] = keep
-        for k in range(len(grouped.merges) - 1, -1, -1):  # later merges first, so that every chain is followed
-            keep, gone = grouped.merges[k]
+        for keep, gone in grouped.merges[::-1].tolist():  # later merges first, so that every chain is followed
             target[gone] = target[keep]
         alive = np.unique(target)  # 0 stays 0
         new = np.zeros(self.count + 1, np.int32)
@@ -55,9 +53,9 @@ class Partition:
             return 0
         parts = cv2.connectedComponents(rest, connectivity=4)[1]
         if self.within is not None:
-            keys = parts.astype(np.int64) * (int(self.within.max()) + 1) + self.within
-            keys[parts == 0] = -1
-            parts = np.unique(keys, return_inverse=True)[1].reshape(parts.shape)
+            at = rest > 0
+            keys = parts[at].astype(np.int64) * (int(self.within.max()) + 1) + self.within[at]
+            parts[at] = np.unique(keys, return_inverse=True)[1] + 1
         areas = np.bincount(parts[rest > 0])
         large = areas >= least
         found = areas.size
@@ -83,10 +81,8 @@ class Partition:
         sizes = np.bincount(self.labels.ravel(), minlength=self.count + 1)
         keep = sizes >= least
         keep[0] = True
-        self.remove(keep)
-
-    def remove(self, keep: NDArray[np.bool_]) -> None:
-        """Keep only the regions marked (index 0 must be), renumbered without gaps; their pixels become 0."""
+        if keep.all():
+            return
         mapping = np.where(keep, np.cumsum(keep) - 1, 0).astype(np.int32)
         self._relabel(mapping, np.nonzero(keep)[0])
 

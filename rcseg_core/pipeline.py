@@ -155,18 +155,22 @@ def partition_by(
     return partition
 
 
-def absorb_points(partition: Partition, signals: Signals, models: Models, config: SegmenterConfig) -> None:
-    """Step 3: points join the regions that predict them; what hangs together and fits nowhere is a region."""
+def absorb_points(partition: Partition, signals: Signals, models: Models, config: SegmenterConfig) -> int:
+    """Step 3: points join the regions that predict them; what hangs together and fits nowhere is a region.
+
+    Returns the number of regions that were added.
+    """
     absorb(signals, partition.labels, partition.leaves, models, config.absorption.max_cost, partition.within)
     measured = signals.flags & INVALID == 0
-    partition.add_leftovers(measured, scaled(config.absorption.min_region, signals.flags))
+    return partition.add_leftovers(measured, scaled(config.absorption.min_region, signals.flags))
 
 
 def settle(partition: Partition, signals: Signals, config: SegmenterConfig) -> None:
     """Specks dissolve into the neighbours that predict them; every measured pixel gets a region."""
     partition.drop_small(scaled(config.absorption.speck, signals.flags))
-    absorb_points(partition, signals, final_models(partition, signals, config)[1], config)
     models = final_models(partition, signals, config)[1]
+    if absorb_points(partition, signals, models, config):
+        models = final_models(partition, signals, config)[1]
     for limit in (1e4, 1e12):  # the order still matters; the limit no longer does
         absorb(signals, partition.labels, partition.leaves, models, limit, partition.within)
     refine(signals, partition.labels, partition.leaves, models, config.absorption.refine_passes, partition.within)

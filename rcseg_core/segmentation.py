@@ -136,11 +136,11 @@ class Segmentation:
 
 
 def compact(groups: NDArray[np.integer]) -> NDArray[np.int32]:
-    """Number the positive values of an image 1..n from the most frequent down (ties by value)."""
-    values, inverse, counts = np.unique(groups, return_inverse=True, return_counts=True)
-    counts = np.where(values > 0, counts, np.iinfo(np.int64).max)  # 0 first
+    """Number the positive values of an image 1..n from the most frequent down (ties by value); 0 stays 0."""
+    counts = np.bincount(groups.ravel())
+    counts[0] = 0
     order = np.argsort(-counts, kind="stable")
-    number = np.empty(values.size, np.int32)
-    shift = 0 if values.size and values[0] == 0 else 1
-    number[order] = np.arange(values.size) + shift
-    return number[inverse].reshape(groups.shape)
+    order = order[counts[order] > 0]
+    number = np.zeros(counts.size, np.int32)
+    number[order] = np.arange(1, order.size + 1)
+    return number[groups]

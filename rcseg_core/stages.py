@@ -9,7 +9,7 @@ from rcseg_core.adjacency import Pairs, find_pairs
 from rcseg_core.config import SegmenterConfig
 from rcseg_core.evidence import KINDS, Rule
 from rcseg_core.generalization import choose_degrees
-from rcseg_core.grouping import group
+from rcseg_core.grouping import add_merged, group
 from rcseg_core.models import Models, fit_models
 from rcseg_core.moments import Moments, accumulate, plane_exponents, region_boxes, tensor_exponents
 from rcseg_core.partition import Partition
@@ -89,6 +89,8 @@ def group_pass(
     planes = degree == 1 and config.generalization.hypothesis == "pair"
     rule = make_rule(signals, pass_degrees(moments, signals, degree, config), config, planes=planes)
     grouped = group(moments, boxes, pairs, rule, config.grouping.edge_gate)
+    if planes:
+        add_merged(moments, grouped.merges)
     alive = partition.apply(grouped)
     kept = Moments(*(a[alive] for a in moments))
     return fit_models(kept, rule.degree[alive], signals.n_range, planes)
