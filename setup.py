@@ -56,7 +56,7 @@ setup(
         "opencv-python-headless>=4.6",
         "matplotlib>=3.6",
         "pyyaml>=6.0",
-        "typer>=0.12",
+        "typer>=0.9",
         "rich>=13.0",
         "rosbags>=0.11",
         "mcap>=1.1",

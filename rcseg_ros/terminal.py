@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -18,6 +19,7 @@ from rcseg_ros.replay import ReplayRequest, ReplaySummary, replay
 from rcseg_ros.settings import bounds
 from rcseg_ros.warmup import warm_up
 
+INTERRUPTED = 130  # exit code after Ctrl-C
 CONSOLE = Console(highlight=False)
 _PROGRESS = Console(stderr=True)
 
@@ -32,6 +34,25 @@ def run_replay(request: ReplayRequest) -> int:
     if not request.bag.exists():
         raise InputError(f"{request.bag}: no such file or folder")
     prepare(request.config)
+    with _progress_bar(request.bag.name) as on_frame:
+        summary = replay(request, on_frame)
+    if summary.frames:
+        CONSOLE.print(_summary_table(summary))
+        CONSOLE.print(_notes(request, summary), soft_wrap=True)
+    if summary.interrupted:
+        return INTERRUPTED
+    if summary.damage:
+        saved = f"{_count(len(summary.frames), 'frame')} before it written to {request.output}"
+        raise InputError(f"{'; '.join(summary.damage)}; {saved}")
+    return 0
+
+
+@contextmanager
+def _progress_bar(name: str) -> Iterator[Callable[[int, int], None]]:
+    """A bar with frames a second and the time left, on a terminal; nothing elsewhere."""
+    if not _PROGRESS.is_terminal:
+        yield lambda done, total: None
+        return
     with Progress(
         TextColumn("{task.description}"),
         BarColumn(),
@@ -40,24 +61,14 @@ def run_replay(request: ReplayRequest) -> int:
         TimeRemainingColumn(),
         console=_PROGRESS,
         transient=True,
-        disable=not _PROGRESS.is_terminal,
     ) as progress:
-        task = progress.add_task(request.bag.name, total=None, rate="-")
+        task = progress.add_task(name, total=None, rate="-")
 
         def on_frame(done: int, total: int) -> None:
             rate = progress.tasks[task].speed or 0.0
             progress.update(task, completed=done, total=total, rate=f"{rate:.1f}")
 
-        summary = replay(request, on_frame)
-    if summary.frames:
-        CONSOLE.print(_summary_table(summary))
-        CONSOLE.print(_notes(request, summary), soft_wrap=True)
-    if summary.interrupted:
-        raise KeyboardInterrupt
-    if summary.damage:
-        saved = f"{_count(len(summary.frames), 'frame')} before it written to {request.output}"
-        raise InputError(f"{'; '.join(summary.damage)}; {saved}")
-    return 0
+        yield on_frame
 
 
 def _summary_table(summary: ReplaySummary) -> Table:
