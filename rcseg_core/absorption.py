@@ -9,10 +9,12 @@ stays a tree of pixels.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
-from rcseg_core.jit import kernel
+from rcseg_core.jit import bare
 from rcseg_core.models import Models, pixel_cost
 from rcseg_core.signals import COLOR_OUTLIER, INVALID, RANGE_OUTLIER, Signals
 
@@ -21,52 +23,84 @@ BUCKETS = 256
 IMPULSE_SHARE = 0.5
 
 
-@kernel
-def _grow(image, flags, labels, leaves, within, models, n_range, law, color_eps2, max_cost):  # type: ignore[no-untyped-def]
-    """Best-first growth: each bucket is a linked list of (pixel, region) offers, cheapest bucket first."""
+class Offers(NamedTuple):
+    """A bucket queue of offers, each a pixel and the labelled pixel that it would join (flat indices).
+
+    first, last : (BUCKETS,) int64 offer or -1; following : (n,) int64; pixel, giver : (n,) int64
+    """
+
+    first: NDArray[np.int64]
+    last: NDArray[np.int64]
+    following: NDArray[np.int64]
+    pixel: NDArray[np.int64]
+    giver: NDArray[np.int64]
+
+
+def _make_offers(pixels: int) -> Offers:
+    """Room for every offer that can be made: each pixel gets at most one from each of its four neighbours."""
+    return Offers(
+        np.full(BUCKETS, -1, np.int64),
+        np.full(BUCKETS, -1, np.int64),
+        *(np.empty(4 * pixels, np.int64) for _ in range(3)),
+    )
+
+
+@bare
+def _offer(offers, used, bucket, pixel, giver):  # type: ignore[no-untyped-def]
+    offers.pixel[used] = pixel
+    offers.giver[used] = giver
+    offers.following[used] = -1
+    if offers.first[bucket] < 0:
+        offers.first[bucket] = used
+    else:
+        offers.following[offers.last[bucket]] = used
+    offers.last[bucket] = used
+
+
+@bare
+def _bucket(models, k, image, flags, row, col, n_range, law, color_eps2, max_cost):  # type: ignore[no-untyped-def]
+    """Bucket of the cost of a pixel under region k, or -1 where it exceeds max_cost."""
+    cost = pixel_cost(models, k, image, flags, row, col, n_range, law, color_eps2)
+    if flags[row, col] & (RANGE_OUTLIER | COLOR_OUTLIER) != 0:
+        cost += IMPULSE_SHARE * max_cost
+    return np.int64(cost * (BUCKETS / max_cost)) if cost < max_cost else np.int64(-1)
+
+
+@bare
+def _grow(image, flags, labels, leaves, within, models, n_range, law, color_eps2, max_cost, offers):  # type: ignore[no-untyped-def]
+    """Best-first growth: unassigned pixels get an offer from each region they touch; the cheapest is taken first."""
     height, width = labels.shape
-    first = np.full(BUCKETS, -1, np.int64)
-    last = np.full(BUCKETS, -1, np.int64)
-    capacity = height * width
-    following = np.empty(capacity, np.int64)
-    offer = np.empty((capacity, 2), np.int64)  # pixel, pixel it would join
     used = 0
-    scale = BUCKETS / max_cost
+    for row in range(height):
+        for col in range(width):
+            if labels[row, col] != 0 or flags[row, col] & INVALID != 0:
+                continue
+            for d in range(4):
+                r = row + (d == 1) - (d == 0)
+                c = col + (d == 3) - (d == 2)
+                if r < 0 or c < 0 or r >= height or c >= width:
+                    continue
+                if labels[r, c] == 0 or within[r, c] != within[row, col]:
+                    continue
+                bucket = _bucket(models, labels[r, c], image, flags, row, col, n_range, law, color_eps2, max_cost)
+                if bucket >= 0:
+                    _offer(offers, used, bucket, row * width + col, r * width + c)
+                    used += 1
     current = 0
-    scan = 0
-    total = height * width
     while True:
-        # every region makes its first offers in a raster scan; after that every absorbed pixel, cheapest first
-        source = np.int64(-1)
-        if scan < total:
-            row = scan // width
-            col = scan % width
-            if labels[row, col] > 0:
-                source = scan
-            scan += 1
-            if source < 0:
-                continue
-        else:
-            while current < BUCKETS and first[current] < 0:
-                current += 1
-            if current == BUCKETS:
-                break
-            item = first[current]
-            first[current] = following[item]
-            if first[current] < 0:
-                last[current] = -1
-            row = offer[item, 0] // width
-            col = offer[item, 0] % width
-            if labels[row, col] != 0:
-                continue
-            giver_row = offer[item, 1] // width
-            giver_col = offer[item, 1] % width
-            labels[row, col] = labels[giver_row, giver_col]
-            leaves[row, col] = leaves[giver_row, giver_col]
-            source = offer[item, 0]
-        row = source // width
-        col = source % width
-        k = labels[row, col]
+        while current < BUCKETS and offers.first[current] < 0:
+            current += 1
+        if current == BUCKETS:
+            break
+        item = offers.first[current]
+        offers.first[current] = offers.following[item]
+        row = offers.pixel[item] // width
+        col = offers.pixel[item] % width
+        if labels[row, col] != 0:
+            continue
+        k = labels[offers.giver[item] // width, offers.giver[item] % width]
+        labels[row, col] = k
+        leaves[row, col] = leaves[offers.giver[item] // width, offers.giver[item] % width]
         for d in range(4):
             r = row + (d == 1) - (d == 0)
             c = col + (d == 3) - (d == 2)
@@ -74,34 +108,14 @@ def _grow(image, flags, labels, leaves, within, models, n_range, law, color_eps2
                 continue
             if labels[r, c] != 0 or flags[r, c] & INVALID != 0 or within[r, c] != within[row, col]:
                 continue
-            cost = pixel_cost(models, k, image, flags, r, c, n_range, law, color_eps2)
-            if flags[r, c] & (RANGE_OUTLIER | COLOR_OUTLIER) != 0:
-                cost += IMPULSE_SHARE * max_cost
-            if not cost < max_cost:
-                continue
-            bucket = np.int64(cost * scale)
-            if used == capacity:
-                bigger = np.empty((2 * capacity, 2), np.int64)
-                bigger[:capacity] = offer
-                offer = bigger
-                longer = np.empty(2 * capacity, np.int64)
-                longer[:capacity] = following
-                following = longer
-                capacity *= 2
-            offer[used, 0] = r * width + c
-            offer[used, 1] = source
-            following[used] = -1
-            if first[bucket] < 0:
-                first[bucket] = used
-            else:
-                following[last[bucket]] = used
-            last[bucket] = used
-            used += 1
-            if bucket < current:
-                current = bucket
+            bucket = _bucket(models, k, image, flags, r, c, n_range, law, color_eps2, max_cost)
+            if bucket >= 0:
+                _offer(offers, used, bucket, r * width + c, offers.pixel[item])
+                used += 1
+                current = min(current, bucket)
 
 
-@kernel
+@bare
 def _refine(image, flags, labels, leaves, within, models, n_range, law, color_eps2, smoothness):  # type: ignore[no-untyped-def]
     """One raster pass: each boundary pixel takes the label with the least cost plus smoothness per other neighbour.
 
@@ -162,13 +176,14 @@ def absorb(
 
     within : (H, W) int32, optional; growth never crosses from one value of it to another
     """
-    if not ((labels == 0) & (signals.flags & INVALID == 0)).any():
+    unassigned = int(np.count_nonzero((labels == 0) & (signals.flags & INVALID == 0)))
+    if unassigned == 0:
         return
     if within is None:
         within = np.zeros_like(labels)
     _grow(
         signals.image, signals.flags, labels, leaves, within, models, signals.n_range, signals.law,
-        signals.color_eps2, max_cost,
+        signals.color_eps2, max_cost, _make_offers(unassigned),
     )  # fmt: skip
 
 

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rcseg_core.jit import kernel
+from rcseg_core.jit import bare
 from rcseg_core.moments import UNIT_PX, Moments, mean_square_gradient, residual, shift_grid, solve
 from rcseg_core.planes import joint_shape, joint_signal, rise
 from rcseg_core.signals import local_scales
@@ -82,7 +82,7 @@ def make_work(moments: Moments) -> Work:
     )
 
 
-@kernel
+@bare
 def move(moments, k, center_x, center_y, work, power, cross):  # type: ignore[no-untyped-def]
     """Sums of region k about another centre (px), into power and cross."""
     dx = (moments.center[k, 0] - center_x) / UNIT_PX
@@ -94,7 +94,7 @@ def move(moments, k, center_x, center_y, work, power, cross):  # type: ignore[no
         shift_grid(moments.cross[k, c], dx, dy, cross[c], part)
 
 
-@kernel
+@bare
 def channel_span(rule, modality):  # type: ignore[no-untyped-def]
     """First channel and one past the last of a modality: 0 range, 1 colour."""
     if modality == 0:
@@ -102,7 +102,7 @@ def channel_span(rule, modality):  # type: ignore[no-untyped-def]
     return rule.n_range, rule.channels
 
 
-@kernel
+@bare
 def own_residuals(moments, k, rule, work, out):  # type: ignore[no-untyped-def]
     """Residual sums of squares of region k about its own models: out[0] range, out[1] colour.
 
@@ -128,7 +128,7 @@ def own_residuals(moments, k, rule, work, out):  # type: ignore[no-untyped-def]
         )
 
 
-@kernel
+@bare
 def earned_tolerance(eps2, relief2, n, own, var):  # type: ignore[no-untyped-def]
     """The tolerance that a side may claim in a higher-degree model, from what its first-degree model misses.
 
@@ -144,7 +144,7 @@ def earned_tolerance(eps2, relief2, n, own, var):  # type: ignore[no-untyped-def
     return min(max(eps2, relief2 * relief), relief)
 
 
-@kernel
+@bare
 def _excess(rise, allowance, budget):  # type: ignore[no-untyped-def]
     """(ratio of rise to all that is allowed, share of the tolerance that is needed)."""
     ratio = rise / (allowance + budget)
@@ -156,7 +156,7 @@ def _excess(rise, allowance, budget):  # type: ignore[no-untyped-def]
     return ratio, np.sqrt(need / budget)
 
 
-@kernel
+@bare
 def compare_planes(planes, i, j, rule, gate_r, gate_c, shape, signal):  # type: ignore[no-untyped-def]
     """`compare` for three-term planes, from centred moments; shape (6,), signal (C, 5) scratch."""
     joint_shape(planes, i, j, shape)
@@ -198,7 +198,7 @@ def compare_planes(planes, i, j, rule, gate_r, gate_c, shape, signal):  # type: 
     return value, height, value <= 1.0
 
 
-@kernel
+@bare
 def _bounded(moments, big, small, rule, own, gate_r, gate_c, work):  # type: ignore[no-untyped-def]
     """Largest ratio over sides and modalities (or of the totals), and the multiple of the tolerance it needs."""
     n_big = moments.power[big, 0, 0]
@@ -248,7 +248,7 @@ def _bounded(moments, big, small, rule, own, gate_r, gate_c, work):  # type: ign
     return value, height
 
 
-@kernel
+@bare
 def trace_inverse(moments, k, box, terms, work):  # type: ignore[no-untyped-def]
     """Tr R^-1 of region k on its local domain, its box scaled to [-1, 1] in x and y; inf if R is singular."""
     p = terms.shape[0]
@@ -281,7 +281,7 @@ def trace_inverse(moments, k, box, terms, work):  # type: ignore[no-untyped-def]
     return trace
 
 
-@kernel
+@bare
 def _bayes(moments, big, small, rule, own, boxes, work):  # type: ignore[no-untyped-def]
     """c_ib of eq. (21) for i = small, b = big, over n_i; and the average extrapolation error against the limits.
 
@@ -312,7 +312,7 @@ def _bayes(moments, big, small, rule, own, boxes, work):  # type: ignore[no-unty
     return value, height
 
 
-@kernel
+@bare
 def compare(moments, i, j, rule, own, boxes, gate_r, gate_c, work):  # type: ignore[no-untyped-def]
     """Compare two regions.
 

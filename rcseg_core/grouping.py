@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from rcseg_core.adjacency import Pairs
 from rcseg_core.evidence import BAYES, Rule, Work, compare, compare_planes, make_work, move, own_residuals
-from rcseg_core.jit import kernel
+from rcseg_core.jit import bare
 from rcseg_core.moments import Moments
 from rcseg_core.planes import Planes, add_planes, center_planes
 
@@ -64,13 +64,13 @@ def make_graph(pairs: Pairs, count: int) -> Graph:
     return graph
 
 
-@kernel
+@bare
 def _link(graph):  # type: ignore[no-untyped-def]
     for half in range(2 * graph.ends.shape[0]):
         _append(graph, graph.ends[half // 2, half % 2], half)
 
 
-@kernel
+@bare
 def _append(graph, node, half):  # type: ignore[no-untyped-def]
     if graph.first[node] < 0:
         graph.first[node] = half
@@ -81,56 +81,72 @@ def _append(graph, node, half):  # type: ignore[no-untyped-def]
     graph.length[node] += 1
 
 
-@kernel
-def _less(a, b):  # type: ignore[no-untyped-def]
-    if a[0] != b[0]:
-        return a[0] < b[0]
-    if a[1] != b[1]:
-        return a[1] < b[1]
-    return a[2] < b[2]
+class Heap(NamedTuple):
+    """A binary heap of pairs, smallest (value, pair) on top; pair = lower id * (N + 1) + higher id breaks ties.
+
+    value : (n,) float64; pair, edge, version : (n,) int64
+    """
+
+    value: NDArray[np.float64]
+    pair: NDArray[np.int64]
+    edge: NDArray[np.int64]
+    version: NDArray[np.int64]
 
 
-@kernel
-def _push(heap, size, value, low, high, edge, version):  # type: ignore[no-untyped-def]
-    """Sift up one (value, low, high, edge, version); returns the heap, doubled where it was full."""
-    if size == heap.shape[0]:
-        bigger = np.empty((2 * size + 16, 5))
-        bigger[:size] = heap
-        heap = bigger
-    at = size
-    heap[at, 0] = value
-    heap[at, 1] = low
-    heap[at, 2] = high
-    heap[at, 3] = edge
-    heap[at, 4] = version
+@bare
+def _set(heap, at, value, pair, edge, version):  # type: ignore[no-untyped-def]
+    heap.value[at] = value
+    heap.pair[at] = pair
+    heap.edge[at] = edge
+    heap.version[at] = version
+
+
+@bare
+def _copy_entry(heap, to, source):  # type: ignore[no-untyped-def]
+    _set(heap, to, heap.value[source], heap.pair[source], heap.edge[source], heap.version[source])
+
+
+@bare
+def _sift_up(heap, at, value, pair, edge, version):  # type: ignore[no-untyped-def]
+    """Put an entry at the hole `at`, or where it belongs above."""
     while at > 0:
         up = (at - 1) // 2
-        if not _less(heap[at], heap[up]):
+        if value > heap.value[up] or (value == heap.value[up] and pair >= heap.pair[up]):
             break
-        for k in range(5):
-            heap[at, k], heap[up, k] = heap[up, k], heap[at, k]
+        _copy_entry(heap, at, up)
         at = up
-    return heap
+    _set(heap, at, value, pair, edge, version)
 
 
-@kernel
-def _pop(heap, size):  # type: ignore[no-untyped-def]
-    """Drop the top of a heap of `size` entries (the caller has read it)."""
-    last = size - 1
-    for k in range(5):
-        heap[0, k] = heap[last, k]
-    at = 0
+@bare
+def _sift_down(heap, at, size, value, pair, edge, version):  # type: ignore[no-untyped-def]
+    """Put an entry at the hole `at`, or where it belongs below."""
     while True:
         child = 2 * at + 1
-        if child >= last:
+        if child >= size:
             break
-        if child + 1 < last and _less(heap[child + 1], heap[child]):
+        if child + 1 < size and (
+            heap.value[child + 1] < heap.value[child]
+            or (heap.value[child + 1] == heap.value[child] and heap.pair[child + 1] < heap.pair[child])
+        ):
             child += 1
-        if not _less(heap[child], heap[at]):
+        if value < heap.value[child] or (value == heap.value[child] and pair <= heap.pair[child]):
             break
-        for k in range(5):
-            heap[at, k], heap[child, k] = heap[child, k], heap[at, k]
+        _copy_entry(heap, at, child)
         at = child
+    _set(heap, at, value, pair, edge, version)
+
+
+@bare
+def _drop_stale(heap, size, alive, version):  # type: ignore[no-untyped-def]
+    """Keep only entries that still hold, in heap order; returns how many."""
+    kept = 0
+    for at in range(size):
+        edge = heap.edge[at]
+        if alive[edge] and version[edge] == heap.version[at]:
+            _sift_up(heap, kept, heap.value[at], heap.pair[at], edge, heap.version[at])
+            kept += 1
+    return kept
 
 
 class State(NamedTuple):
@@ -151,14 +167,14 @@ class State(NamedTuple):
     signal: NDArray[np.float64]
 
 
-@kernel
+@bare
 def _size(state, k):  # type: ignore[no-untyped-def]
     return state.planes.shape[k, 0] if state.flat else state.moments.power[k, 0, 0]
 
 
-@kernel
+@bare
 def _evaluate(graph, edge, state, gated, limit, heap, size):  # type: ignore[no-untyped-def]
-    """Compare the ends of an edge; push the pair if it is allowed. Returns (heap, size)."""
+    """Compare the ends of an edge; push the pair if it is allowed. Returns the size of the heap."""
     graph.version[edge] += 1
     i = graph.ends[edge, 0]
     j = graph.ends[edge, 1]
@@ -177,21 +193,29 @@ def _evaluate(graph, edge, state, gated, limit, heap, size):  # type: ignore[no-
         )
     if allowed or height <= limit:
         graph.height[edge] = height
-        heap = _push(heap, size, value, min(i, j), max(i, j), edge, graph.version[edge])
-        return heap, size + 1
-    return heap, size
+        if size == heap.value.shape[0]:
+            size = _drop_stale(heap, size, graph.alive, graph.version)
+        pair = min(i, j) * state.boxes.shape[0] + max(i, j)
+        _sift_up(heap, size, value, pair, edge, graph.version[edge])
+        size += 1
+    return size
 
 
-@kernel
+@bare
 def _absorb_moments(moments, big, small, work):  # type: ignore[no-untyped-def]
     """Add the sums of `small` to those of `big`, about the centre of `big`."""
     move(moments, small, moments.center[big, 0], moments.center[big, 1], work, work.power, work.cross)
-    moments.power[big] += work.power
-    moments.cross[big] += work.cross
-    moments.energy[big] += moments.energy[small]
+    for a in range(work.power.shape[0]):
+        for b in range(work.power.shape[1]):
+            moments.power[big, a, b] += work.power[a, b]
+    for c in range(work.cross.shape[0]):
+        moments.energy[big, c] += moments.energy[small, c]
+        for a in range(work.cross.shape[1]):
+            for b in range(work.cross.shape[2]):
+                moments.cross[big, c, a, b] += work.cross[c, a, b]
 
 
-@kernel
+@bare
 def _recenter(moments, k, box, work):  # type: ignore[no-untyped-def]
     """Move the origin back to the middle of the box once it is off by more than a quarter of its size."""
     x = 0.5 * (box[1] + box[3])
@@ -200,13 +224,18 @@ def _recenter(moments, k, box, work):  # type: ignore[no-untyped-def]
     off_y = abs(moments.center[k, 1] - y)
     if off_x > 0.25 * (box[3] - box[1]) + 1.0 or off_y > 0.25 * (box[2] - box[0]) + 1.0:
         move(moments, k, x, y, work, work.power, work.cross)
-        moments.power[k] = work.power
-        moments.cross[k] = work.cross
+        for a in range(work.power.shape[0]):
+            for b in range(work.power.shape[1]):
+                moments.power[k, a, b] = work.power[a, b]
+        for c in range(work.cross.shape[0]):
+            for a in range(work.cross.shape[1]):
+                for b in range(work.cross.shape[2]):
+                    moments.cross[k, c, a, b] = work.cross[c, a, b]
         moments.center[k, 0] = x
         moments.center[k, 1] = y
 
 
-@kernel
+@bare
 def _join(keep, gone, state):  # type: ignore[no-untyped-def]
     """Region `keep` takes in `gone`: moments, box, the higher degree of the two, and its own residuals anew."""
     boxes = state.boxes
@@ -225,7 +254,7 @@ def _join(keep, gone, state):  # type: ignore[no-untyped-def]
     own_residuals(state.moments, keep, state.rule, state.work, state.own[keep])
 
 
-@kernel
+@bare
 def _find_edge(graph, node, target):  # type: ignore[no-untyped-def]
     """The living edge between two nodes, or -1; dead entries met on the way are unlinked from the list of `node`."""
     before = np.int64(-1)
@@ -248,7 +277,7 @@ def _find_edge(graph, node, target):  # type: ignore[no-untyped-def]
     return np.int64(-1)
 
 
-@kernel
+@bare
 def _merge_edges(graph, keep, gone, fresh):  # type: ignore[no-untyped-def]
     """Give the edges of `gone` to `keep`; parallel edges become one. Lists in `fresh` what must be compared anew.
 
@@ -285,28 +314,28 @@ def _merge_edges(graph, keep, gone, fresh):  # type: ignore[no-untyped-def]
     return count
 
 
-@kernel
-def _run(graph, state, gated, limit, merges, heights):  # type: ignore[no-untyped-def]
+@bare
+def _run(graph, state, scratch, gated, limit, merges, heights):  # type: ignore[no-untyped-def]
     """Best-first loop. Fills merges (kept, gone) and heights; returns how many, and the number of comparisons."""
     count = state.boxes.shape[0] - 1
     edges = graph.ends.shape[0]
-    full_at = np.empty(count + 1)
+    full_at = scratch.full_at
+    heap = scratch.heap
+    fresh = scratch.fresh
     for k in range(1, count + 1):
         full_at[k] = _size(state, k)
         if not state.flat:
             own_residuals(state.moments, k, state.rule, state.work, state.own[k])
-    heap = np.empty((2 * edges + 16, 5))
     size = 0
     for edge in range(edges):
-        heap, size = _evaluate(graph, edge, state, gated, limit, heap, size)
+        size = _evaluate(graph, edge, state, gated, limit, heap, size)
     comparisons = edges
-    fresh = np.empty(edges, np.int64)
     merged = 0
     while size > 0:
-        edge = np.int64(heap[0, 3])
-        current = graph.alive[edge] and graph.version[edge] == np.int64(heap[0, 4])
-        _pop(heap, size)
+        edge = heap.edge[0]
+        current = graph.alive[edge] and graph.version[edge] == heap.version[0]
         size -= 1
+        _sift_down(heap, 0, size, heap.value[size], heap.pair[size], heap.edge[size], heap.version[size])
         if not current:
             continue
         i = graph.ends[edge, 0]
@@ -321,19 +350,34 @@ def _run(graph, state, gated, limit, merges, heights):  # type: ignore[no-untype
         _join(keep, gone, state)
         fresh_count = _merge_edges(graph, keep, gone, fresh)
         grown = _size(state, keep)
-        if grown < GROWTH * full_at[keep]:
-            for e in fresh[:fresh_count]:
-                heap, size = _evaluate(graph, e, state, gated, limit, heap, size)
-            comparisons += fresh_count
-            continue
-        full_at[keep] = grown
-        half = graph.first[keep]
-        while half >= 0:
-            if graph.alive[half // 2]:
-                heap, size = _evaluate(graph, half // 2, state, gated, limit, heap, size)
-                comparisons += 1
-            half = graph.following[half]
+        if grown >= GROWTH * full_at[keep]:
+            full_at[keep] = grown
+            fresh_count = 0
+            half = graph.first[keep]
+            while half >= 0:
+                if graph.alive[half // 2]:
+                    fresh[fresh_count] = half // 2
+                    fresh_count += 1
+                half = graph.following[half]
+        for at in range(fresh_count):
+            size = _evaluate(graph, fresh[at], state, gated, limit, heap, size)
+        comparisons += fresh_count
     return merged, comparisons
+
+
+class Scratch(NamedTuple):
+    """Arrays of the loop: the heap, edges to compare anew, size of each region when last compared in full."""
+
+    heap: Heap
+    fresh: NDArray[np.int64]
+    full_at: NDArray[np.float64]
+
+
+def make_scratch(edges: int, count: int) -> Scratch:
+    """Arrays for `_run`. An edge has one entry that holds; the others are stale and dropped when room is short."""
+    room = 4 * edges + 64
+    heap = Heap(np.empty(room), np.empty(room, np.int64), np.empty(room, np.int64), np.empty(room, np.int64))
+    return Scratch(heap, np.empty(max(edges, 1), np.int64), np.empty(count + 1))
 
 
 class Grouped(NamedTuple):
@@ -369,12 +413,12 @@ def group(
     merges = np.empty((count, 2), np.int64)
     heights = np.empty(count)
     merged, comparisons = _run(
-        make_graph(pairs, count - 1), state, gated, 0.0 if limit <= 1.0 else limit, merges, heights
+        make_graph(pairs, count - 1), state, make_scratch(len(pairs.boundary), count - 1), gated, 0.0 if limit <= 1.0 else limit, merges, heights
     )
     return Grouped(merges[:merged], heights[:merged], int(comparisons))
 
 
-@kernel
+@bare
 def _add_merged(moments, merges, work):  # type: ignore[no-untyped-def]
     for t in range(merges.shape[0]):
         _absorb_moments(moments, merges[t, 0], merges[t, 1], work)

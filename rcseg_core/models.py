@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rcseg_core.jit import kernel
+from rcseg_core.jit import bare
 from rcseg_core.moments import UNIT_PX, Moments, plane_exponents, solve, tensor_exponents
 from rcseg_core.signals import COLOR_OUTLIER, INVALID, RANGE_OUTLIER, local_scales
 
@@ -25,7 +25,7 @@ class Models(NamedTuple):
     coef: NDArray[np.float64]
 
 
-@kernel
+@bare
 def _fit(moments, degree, first, last, modality, terms, models_degree, coef, gram, flat):  # type: ignore[no-untyped-def]
     """Fit channels first..last-1 of every region whose models_degree[k, modality] is `degree`."""
     for k in range(1, moments.energy.shape[0]):
@@ -58,7 +58,7 @@ def fit_models(
     return Models(moments.center, degree, coef)
 
 
-@kernel
+@bare
 def predict(models, k, row, col, modality, c):  # type: ignore[no-untyped-def]
     """Whitened value of channel c of region k at a pixel (Horner in y, then x); modality picks the degree."""
     degree = models.degree[k, modality]
@@ -73,7 +73,7 @@ def predict(models, k, row, col, modality, c):  # type: ignore[no-untyped-def]
     return total
 
 
-@kernel
+@bare
 def pixel_cost(models, k, image, flags, row, col, n_range, law, color_eps2):  # type: ignore[no-untyped-def]
     """Squared residual of a pixel under region k, each modality over its noise plus half of the tolerance.
 
@@ -100,7 +100,7 @@ def pixel_cost(models, k, image, flags, row, col, n_range, law, color_eps2):  # 
     return cost
 
 
-@kernel
+@bare
 def _render(models, labels, n_range, out):  # type: ignore[no-untyped-def]
     height, width, channels = out.shape
     for row in range(height):

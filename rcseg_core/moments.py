@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rcseg_core.jit import kernel
+from rcseg_core.jit import bare, kernel
 
 #: Coordinates are pixels divided by this, which keeps eighth powers of a VGA image near one.
 UNIT_PX = 32.0
@@ -136,7 +136,7 @@ def accumulate(
     return Moments(center, power, cross, energy)
 
 
-@kernel
+@bare
 def shift_grid(grid, dx, dy, out, work):  # type: ignore[no-untyped-def]
     """Sums of x^a y^b (weighted or not) about an origin moved by (-dx, -dy): sum (x+dx)^a (y+dy)^b.
 
@@ -158,7 +158,7 @@ def shift_grid(grid, dx, dy, out, work):  # type: ignore[no-untyped-def]
                 out[a, b] += dy * out[a, b - 1]
 
 
-@kernel
+@bare
 def solve(power, cross, first, last, exponents, gram, coef):  # type: ignore[no-untyped-def]
     """Least-squares coefficients of channels first..last-1: A = V R^-1, eq. (13), by equilibrated Cholesky.
 
@@ -206,7 +206,7 @@ def solve(power, cross, first, last, exponents, gram, coef):  # type: ignore[no-
     return rank
 
 
-@kernel
+@bare
 def residual(power, cross, energy, first, last, exponents, coef):  # type: ignore[no-untyped-def]
     """Sum of squared residuals of any model over a region, eq. (14): tr(T T^T - 2 A V^T + A R A^T), >= 0."""
     p = exponents.shape[0]
@@ -224,7 +224,7 @@ def residual(power, cross, energy, first, last, exponents, coef):  # type: ignor
     return total
 
 
-@kernel
+@bare
 def mean_square_gradient(power, terms, coef):  # type: ignore[no-untyped-def]
     """Mean over a region of |grad s|^2 per UNIT_PX^2 for one channel with coefficients coef (p,)."""
     p = terms.shape[0]

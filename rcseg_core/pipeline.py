@@ -173,8 +173,9 @@ def settle(partition: Partition, signals: Signals, config: SegmenterConfig) -> N
         models = final_models(partition, signals, config)[1]
     for limit in (1e4, 1e12):  # the order still matters; the limit no longer does
         absorb(signals, partition.labels, partition.leaves, models, limit, partition.within)
-    refine(signals, partition.labels, partition.leaves, models, config.absorption.refine_passes, partition.within)
-    if partition.within is not None:  # small parts of `within` that no region reached
+    if partition.within is None:
+        refine(signals, partition.labels, partition.leaves, models, config.absorption.refine_passes)
+    else:  # small parts of `within` that no region reached
         partition.add_leftovers(partition.within > 0, 1)
 
 

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rcseg_core.jit import kernel
+from rcseg_core.jit import bare
 from rcseg_core.moments import UNIT_PX, Moments
 
 #: Spread below this share of its square root trace is a line of pixels: the slope across it is not determined.
@@ -35,7 +35,7 @@ class Planes(NamedTuple):
     signal: NDArray[np.float64]
 
 
-@kernel
+@bare
 def slopes(sxx, sxy, syy, sxv, syv):  # type: ignore[no-untyped-def]
     """Least-squares slopes; the minimum-norm ones where the pixels lie on a line, zero for a point."""
     det = sxx * syy - sxy * sxy
@@ -47,7 +47,7 @@ def slopes(sxx, sxy, syy, sxv, syv):  # type: ignore[no-untyped-def]
     return 0.0, 0.0
 
 
-@kernel
+@bare
 def _center(power, cross, center, shape, signal):  # type: ignore[no-untyped-def]
     for k in range(1, power.shape[0]):
         n = power[k, 0, 0]
@@ -79,7 +79,7 @@ def center_planes(moments: Moments) -> Planes:
     return planes
 
 
-@kernel
+@bare
 def joint_shape(planes, i, j, out):  # type: ignore[no-untyped-def]
     """Shape moments of the union (parallel-axis theorem) into out (6,)."""
     a = planes.shape[i]
@@ -96,7 +96,7 @@ def joint_shape(planes, i, j, out):  # type: ignore[no-untyped-def]
     out[5] = a[5] + b[5] + share * dy * dy
 
 
-@kernel
+@bare
 def joint_signal(planes, i, j, c, shape, out):  # type: ignore[no-untyped-def]
     """Signal moments of channel c of the union into out (5,); shape : joint_shape of the pair."""
     a = planes.shape[i]
@@ -113,7 +113,7 @@ def joint_signal(planes, i, j, c, shape, out):  # type: ignore[no-untyped-def]
     out[4] = gy
 
 
-@kernel
+@bare
 def rise(planes, k, c, shape, signal):  # type: ignore[no-untyped-def]
     """What the joint plane (shape, signal) costs region k in channel c more than its own plane."""
     own = planes.shape[k]
@@ -124,11 +124,14 @@ def rise(planes, k, c, shape, signal):  # type: ignore[no-untyped-def]
     return own[0] * dv * dv + own[3] * gx * gx + 2.0 * own[4] * gx * gy + own[5] * gy * gy
 
 
-@kernel
+@bare
 def add_planes(planes, keep, gone, shape, signal):  # type: ignore[no-untyped-def]
     """Region `keep` takes in `gone`; shape (6,) and signal (C, 5) are scratch."""
     joint_shape(planes, keep, gone, shape)
     for c in range(planes.signal.shape[1]):
         joint_signal(planes, keep, gone, c, shape, signal[c])
-    planes.shape[keep] = shape
-    planes.signal[keep] = signal
+    for a in range(6):
+        planes.shape[keep, a] = shape[a]
+    for c in range(planes.signal.shape[1]):
+        for a in range(5):
+            planes.signal[keep, c, a] = signal[c, a]

@@ -16,7 +16,7 @@ from rcseg_core.cleaning import color_median, local_median
 from rcseg_core.config import SegmenterConfig
 from rcseg_core.errors import ConfigError
 from rcseg_core.frame import RangeColorFrame
-from rcseg_core.jit import kernel
+from rcseg_core.jit import bare
 from rcseg_core.moments import UNIT_PX
 from rcseg_core.noise import NoiseModel, estimate_noise
 
@@ -80,7 +80,7 @@ class Signals:
         )
 
 
-@kernel
+@bare
 def local_scales(law, value):  # type: ignore[no-untyped-def]
     """Variance of the range noise and squared range tolerance, both in sigma^2, at a whitened signal value."""
     sigma = law[0] + value * (law[1] + value * law[2])
@@ -120,16 +120,13 @@ def build_signals(
     law = _law(noise, scale[0], typical, inverse, frame, config.grouping.range_tolerance)
     eps_c = config.grouping.color_tolerance / noise.color
 
-    image = _whiten(raw, color, scale, offset)
-    median = _whiten(median_r, median_c, scale, offset)
-    flags = np.where(valid, 0, INVALID).astype(np.uint8)
-    flag_outliers(image, median, law, n_range, config.edges.outlier_threshold, flags)
-    replace = flags & (INVALID | RANGE_OUTLIER) != 0
-    cleaned = image.copy()
-    cleaned[replace, :n_range] = median[replace, :n_range]
-    replace = flags & COLOR_OUTLIER != 0
-    cleaned[replace, n_range:] = median[replace, n_range:]
-    image[~valid, :n_range] = 0
+    shape = (*valid.shape, n_range + 3)
+    image, cleaned = np.empty(shape, np.float32), np.empty(shape, np.float32)
+    flags = np.empty(valid.shape, np.uint8)
+    whiten(
+        raw, median_r, color, median_c, valid, scale, offset, law, config.edges.outlier_threshold, image, cleaned,
+        flags,
+    )  # fmt: skip
     return Signals(
         image, cleaned, flags, n_range, scale, offset, law, float(np.sum(eps_c**2)) / 3.0,
         _slope(frame, scale, offset, inverse), noise, inverse,
@@ -151,28 +148,50 @@ def _slope(
     return max(pitch, 1e-9) * UNIT_PX / float(scale[2]), 0.0
 
 
-@kernel
-def flag_outliers(image, median, law, n_range, threshold, flags):  # type: ignore[no-untyped-def]
-    """Mark pixels further than `threshold` sigmas from the local median, range and colour apart."""
-    if threshold <= 0.0:
-        return
-    height, width, channels = image.shape
+@bare
+def whiten(raw, median_r, color, median_c, valid, scale, offset, law, threshold, image, cleaned, flags):  # type: ignore[no-untyped-def]
+    """Whiten a frame into `image`, flag impulses, and put the local median in their place in `cleaned`.
+
+    raw, median_r : (H, W, Cr) float32; color, median_c : (H, W, 3) uint8; valid : (H, W) bool; scale, offset :
+    (C,) float64; threshold : sigmas from the local median that make an impulse, 0 for none.
+    Out: image, cleaned (H, W, C) float32, flags (H, W) uint8.
+    """
+    height, width, n_range = raw.shape
+    limit = threshold * threshold
     for row in range(height):
         for col in range(width):
-            if flags[row, col] & INVALID == 0:
-                var, _ = local_scales(law, median[row, col, 0])
-                far = 0.0
-                for c in range(n_range):
-                    d = image[row, col, c] - median[row, col, c]
-                    far = max(far, d * d)
-                if far > threshold * threshold * var:
-                    flags[row, col] |= RANGE_OUTLIER
+            flag = 0
             far = 0.0
-            for c in range(n_range, channels):
-                d = image[row, col, c] - median[row, col, c]
-                far = max(far, d * d)
-            if far > threshold * threshold:
-                flags[row, col] |= COLOR_OUTLIER
+            for c in range(n_range):
+                center = (median_r[row, col, c] - offset[c]) / scale[c]
+                cleaned[row, col, c] = center
+                value = (raw[row, col, c] - offset[c]) / scale[c]
+                image[row, col, c] = value
+                far = max(far, (value - center) * (value - center))
+            if not valid[row, col]:
+                flag = INVALID
+                for c in range(n_range):
+                    image[row, col, c] = 0.0
+            else:
+                var, _ = local_scales(law, np.float64(cleaned[row, col, 0]))
+                if threshold > 0.0 and far > limit * var:
+                    flag = RANGE_OUTLIER
+                else:
+                    for c in range(n_range):
+                        cleaned[row, col, c] = image[row, col, c]
+            far = 0.0
+            for c in range(3):
+                center = (median_c[row, col, c] - offset[n_range + c]) / scale[n_range + c]
+                cleaned[row, col, n_range + c] = center
+                value = (color[row, col, c] - offset[n_range + c]) / scale[n_range + c]
+                image[row, col, n_range + c] = value
+                far = max(far, (value - center) * (value - center))
+            if threshold > 0.0 and far > limit:
+                flag |= COLOR_OUTLIER
+            else:
+                for c in range(n_range, n_range + 3):
+                    cleaned[row, col, c] = image[row, col, c]
+            flags[row, col] = flag
 
 
 def _range_signal(frame: RangeColorFrame, inverse: bool) -> NDArray[np.float32]:
@@ -208,18 +227,3 @@ def _law(
     extent = float(np.linalg.norm(high - low))
     sigma_m = float(np.sqrt(np.mean(noise.range_law[:, 0] ** 2)))
     return np.array([1.0, 0.0, 0.0, tolerance * extent / sigma_m, 0.0])
-
-
-def _whiten(
-    range_signal: NDArray[np.float32],
-    color: NDArray[np.uint8],
-    scale: NDArray[np.float64],
-    offset: NDArray[np.float64],
-) -> NDArray[np.float32]:
-    n_range = range_signal.shape[2]
-    out = np.empty((*range_signal.shape[:2], n_range + 3), np.float32)
-    gain = (1.0 / scale).astype(np.float32)
-    base = offset.astype(np.float32)
-    np.multiply(range_signal - base[:n_range], gain[:n_range], out=out[..., :n_range])
-    np.multiply(color - base[n_range:], gain[n_range:], out=out[..., n_range:])
-    return out
