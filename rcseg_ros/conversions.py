@@ -205,6 +205,37 @@ def decode_cloud(message: Any) -> Cloud:
     MessageError
         Reasons ``missing_field``, ``bad_field``, ``bad_step``, ``truncated_data``, ``empty_cloud``.
     """
+    data, shape, strides = _cloud_layout(message)
+    fields = {str(field.name): field for field in message.fields}
+    order = ">" if message.is_bigendian else "<"
+
+    def column(name: str, kind: str | None = None) -> NDArray[Any]:
+        """(H, W) view of one field; ``kind`` overrides the declared number type (same size)."""
+        field = fields[name]
+        offset = int(field.offset)
+        dtype = np.dtype(kind or _POINT_FIELD_TYPES.get(int(field.datatype), "V1")).newbyteorder(order)
+        if dtype.kind == "V" or offset + dtype.itemsize > message.point_step:
+            raise MessageError(
+                "bad_field",
+                f"cloud: field {name!r} (datatype {field.datatype}, offset {offset}) "
+                f"does not fit into point_step {message.point_step}",
+            )
+        return np.ndarray(shape, dtype, data, offset, strides)
+
+    missing = [axis for axis in "xyz" if axis not in fields]
+    if missing:
+        raise MessageError(
+            "missing_field",
+            f"cloud: no field {', '.join(missing)}; it has {', '.join(fields) or 'none'}",
+        )
+    points = np.empty((*shape, 3), np.float32)
+    for axis, name in enumerate("xyz"):
+        points[..., axis] = column(name)
+    return Cloud(points, _cloud_color(fields, column, shape))
+
+
+def _cloud_layout(message: Any) -> tuple[NDArray[np.uint8], tuple[int, int], tuple[int, int]]:
+    """Bytes of a cloud, its (rows, columns), and the bytes from row to row and from point to point."""
     height, width = int(message.height), int(message.width)
     point_step, row_step = int(message.point_step), int(message.row_step)
     what = f"cloud: {width}x{height} points"
@@ -218,31 +249,7 @@ def decode_cloud(message: Any) -> Cloud:
     data = np.frombuffer(message.data, np.uint8)
     if data.size < row_step * (height - 1) + row_bytes:
         raise MessageError("truncated_data", f"{what} need {row_step * height} bytes, got {data.size}")
-
-    fields = {str(field.name): field for field in message.fields}
-    order = ">" if message.is_bigendian else "<"
-
-    def column(name: str, kind: str | None = None) -> NDArray[Any]:
-        """(H, W) view of one field; ``kind`` overrides the declared number type (same size)."""
-        field = fields[name]
-        dtype = np.dtype(kind or _POINT_FIELD_TYPES.get(int(field.datatype), "V1")).newbyteorder(order)
-        if dtype.kind == "V" or int(field.offset) + dtype.itemsize > point_step:
-            raise MessageError(
-                "bad_field",
-                f"cloud: field {name!r} (datatype {field.datatype}, offset {field.offset}) "
-                f"does not fit into point_step {point_step}",
-            )
-        return np.ndarray((height, width), dtype, data, int(field.offset), (row_step, point_step))
-
-    missing = [axis for axis in "xyz" if axis not in fields]
-    if missing:
-        raise MessageError(
-            "missing_field", f"cloud: no field {', '.join(missing)}; it has {', '.join(fields) or 'none'}"
-        )
-    points = np.empty((height, width, 3), np.float32)
-    for axis, name in enumerate("xyz"):
-        points[..., axis] = column(name)
-    return Cloud(points, _cloud_color(fields, column, (height, width)))
+    return data, (height, width), (row_step, point_step)
 
 
 def _cloud_color(fields: dict[str, Any], column: Any, shape: tuple[int, int]) -> NDArray[np.uint8] | None:

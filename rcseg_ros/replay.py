@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import signal
+import threading
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -93,6 +94,9 @@ class Interrupt:
             self.requested = True
             signal.signal(signal.SIGINT, signal.default_int_handler)
 
+        if threading.current_thread() is not threading.main_thread():
+            yield  # only the main thread is told of signals
+            return
         before = signal.signal(signal.SIGINT, note)
         try:
             yield
@@ -114,39 +118,42 @@ def replay(
     InputError
         Unusable recording, topics or output folder, or not one usable frame. Nothing is written then.
     """
-    interrupt = Interrupt()
     with (
         StagedFolder(request.output, request.force, METRICS) as stage,
         Recording(request.bag) as recording,
     ):
-        inputs = find_topics(recording, request.topics, request.range_from)
-        summary = ReplaySummary(inputs)
-        total = min(recording.topics[inputs.range].count, request.max_frames or 2**63)
+        summary = ReplaySummary(find_topics(recording, request.topics, request.range_from))
         writer = _Writer(stage.path, request.overlays)
         start = perf_counter()
         try:
-            with interrupt.armed():
-                pairs = _pairs(recording, inputs, request, summary, writer)
-                work = FrameWork(
-                    request.config,
-                    recording.decode,
-                    request.outputs,
-                    _truth(recording),
-                    request.overlays,
-                )
-                for result in _in_order(work, pairs, request.workers, interrupt):
-                    _take(result, summary, writer)
-                    on_frame(len(summary.frames) + summary.rejected.total(), total)
-        finally:
+            _segment_all(recording, request, summary, writer, on_frame)
+        finally:  # whatever happened: what was finished is kept, and can be read
             summary.seconds = perf_counter() - start
             summary.damage = recording.damage
-            summary.interrupted = interrupt.requested
             writer.finish(summary.document(request), request.config)
             if summary.frames:
                 stage.commit()
     if not summary.frames and not summary.interrupted:
         raise InputError(_why_nothing(request, summary))
     return summary
+
+
+def _segment_all(
+    recording: Recording,
+    request: ReplayRequest,
+    summary: ReplaySummary,
+    writer: _Writer,
+    on_frame: Callable[[int, int], None],
+) -> None:
+    total = min(recording.topics[summary.inputs.range].count, request.max_frames or 2**63)
+    work = FrameWork(request.config, recording.decode, request.outputs, _truth(recording), request.overlays)
+    interrupt = Interrupt()
+    with interrupt.armed():
+        pairs = _pairs(recording, request, summary, writer)
+        for result in _in_order(work, pairs, request.workers, interrupt):
+            _take(result, summary, writer)
+            on_frame(len(summary.frames) + summary.rejected.total(), total)
+    summary.interrupted = interrupt.requested
 
 
 def _take(result: FrameResult, summary: ReplaySummary, writer: _Writer) -> None:
@@ -180,13 +187,10 @@ def _truth(recording: Recording) -> dict[str, dict[int, RawMessage]]:
 
 
 def _pairs(
-    recording: Recording,
-    inputs: InputTopics,
-    request: ReplayRequest,
-    summary: ReplaySummary,
-    writer: _Writer,
+    recording: Recording, request: ReplayRequest, summary: ReplaySummary, writer: _Writer
 ) -> Iterator[Pair]:
     """Pairs of raw messages as they become complete; transforms go straight to the result."""
+    inputs = summary.inputs
     sync = FrameSync(
         slop_ns=request.slop_ns,
         queue_size=request.queue_size,
