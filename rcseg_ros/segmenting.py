@@ -12,21 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rcseg_core import RangeColorFrame, Segmentation, SegmenterConfig, segment
-from rcseg_core.drawing import overlay
 from rcseg_core.errors import InputError
 from rcseg_core.evaluation import evaluate_labels
 from rcseg_ros.assembly import assemble_frame
 from rcseg_ros.bag import RawMessage
 from rcseg_ros.conversions import Header, MessageError, decode_labels, header_of
-from rcseg_ros.messages import region_array
-from rcseg_ros.outputs import (
-    cloud_message,
-    edges_message,
-    header_message,
-    labels_message,
-    picture_message,
-)
 from rcseg_ros.result_bag import make_message, serialize
+from rcseg_ros.results import ResultMessages
 from rcseg_ros.sync import Pair
 
 OUTPUTS = ("labels", "surface_labels", "regions", "edges", "overlay", "reconstruction")
@@ -83,34 +75,9 @@ class FrameWork:
         header = header_of(range_message)
         row = frame_row(header, pair.offset_ns, frame, result, seconds)
         row |= self._compare(pair.stamp_ns, result)
-        picture = overlay(frame.color, result.labels) if self.picture or "overlay" in self.outputs else None
-        outputs = tuple(self._encode(name, header, frame, result, picture) for name in self.outputs)
-        return FrameResult(raw.log_ns, row, outputs, picture if self.picture else None)
-
-    def _encode(
-        self,
-        name: str,
-        header: Header,
-        frame: RangeColorFrame,
-        result: Segmentation,
-        picture: NDArray[np.uint8] | None,
-    ) -> Output:
-        head = header_message(header, make_message)
-        if name == "labels":
-            message = labels_message(result.labels, head, make_message)
-        elif name == "surface_labels":
-            message = labels_message(result.surface_labels, head, make_message)
-        elif name == "regions":
-            message = region_array(frame, result, head, make_message)
-        elif name == "edges":
-            message = edges_message(result.edges, head, make_message)
-        elif name == "overlay":
-            assert picture is not None
-            message = picture_message(picture, head, make_message)
-        else:
-            points, color = result.reconstruct()
-            message = cloud_message(points, color, result.labels, head, make_message)
-        return Output(name, message.__msgtype__, serialize(message))
+        messages = ResultMessages(header, frame, result, make_message)
+        outputs = tuple(_serialized(name, getattr(messages, name)) for name in self.outputs)
+        return FrameResult(raw.log_ns, row, outputs, messages.picture if self.picture else None)
 
     def _compare(self, stamp_ns: int, result: Segmentation) -> dict[str, Any]:
         """Metrics against recorded truth of the same stamp, where there is any."""
@@ -128,6 +95,10 @@ class FrameWork:
                     "covering": metrics.covering,
                 }
         return {"truth": found} if found else {}
+
+
+def _serialized(name: str, message: Any) -> Output:
+    return Output(name, message.__msgtype__, serialize(message))
 
 
 def frame_row(
