@@ -18,7 +18,7 @@ test: $(VENV)/.tools $(if $(ROS),$(VENV)/.ros)
 test-core: $(VENV)/.tools
 	$(BIN)/python -m pytest test/core test/oracle
 
-check: $(VENV)/.tools
+check: $(VENV)/.checkers
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
@@ -43,7 +43,12 @@ $(VENV)/.installed: $(VENV)/.made setup.py pyproject.toml
 
 $(VENV)/.tools: $(VENV)/.installed
 	@echo "Installing the test tools into $(VENV)"
-	@$(PIP) --editable '.[test,dev]'
+	@$(PIP) --editable '.[test]'
+	@touch $@
+
+$(VENV)/.checkers: $(VENV)/.tools
+	@echo "Installing ruff, mypy and the other checkers into $(VENV)"
+	@$(PIP) --editable '.[dev]'
 	@touch $@
 
 # rclpy and Fast DDS from wheels, and our messages built against them: no ROS on the machine is needed.

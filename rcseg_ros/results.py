@@ -1,4 +1,4 @@
-"""Every output message of one frame, made on demand and once: what the node publishes and a result bag holds."""
+"""Every output message of one frame, made on demand and once: the node publishes them, bags hold them."""
 
 from __future__ import annotations
 
