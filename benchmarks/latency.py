@@ -12,7 +12,6 @@ at 30 Hz, to count what of the inputs reaches the node. Run with the ROS wheels 
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 import tempfile
 import time
@@ -21,8 +20,10 @@ from pathlib import Path
 import numpy as np
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT / "test" / "ros"))  # the peer and the node process of the tests
-PROFILE = ROOT / "config" / "fastdds_large_messages.xml"
+sys.path.insert(0, str(ROOT / "test" / "ros"))
+
+import live  # noqa: E402  the peer and the node process of the tests
+
 PERIOD_NS = 33_000_000
 
 
@@ -35,25 +36,23 @@ def main() -> None:
     )
     options.add_argument("--outputs", default="labels", help="outputs that are listened to, with commas")
     given = options.parse_args()
-    if not given.default_transport:
-        os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"] = str(PROFILE)
-    import live  # after the profile is chosen
-
+    if given.default_transport:
+        live.ISOLATED["FASTRTPS_DEFAULT_PROFILES_FILE"] = ""
     with tempfile.TemporaryDirectory() as folder:
         node = live.NodeProcess(Path(folder) / "log.txt")
         node.wait_for_output("active")
         peer = live.Peer(outputs=tuple(given.outputs.split(",")))
         peer.connected("points", "image", "camera_info")
         frame = live.scene(height=480, width=640)
-        added(live, peer, frame, given.frames)
-        lost(live, peer, frame, given.frames, given.rate)
+        added(peer, frame, given.frames)
+        lost(peer, frame, given.frames, given.rate)
         peer.close()
         code, _ = node.stop()
         if code:
             sys.exit(node.output())
 
 
-def added(live, peer, frame, count: int) -> None:
+def added(peer, frame, count: int) -> None:
     """Frames one after another: each is published when the labels of the one before have come."""
     start_ns, whole_ms = time.time_ns(), []
     cloud, image = live.cloud_of(frame, 0), live.image_of(frame, 0)
@@ -79,7 +78,7 @@ def added(live, peer, frame, count: int) -> None:
     print(f"  image published to labels heard   p50 {p50:7.1f}   p95 {p95:7.1f}")
 
 
-def lost(live, peer, frame, count: int, rate_hz: float) -> None:
+def lost(peer, frame, count: int, rate_hz: float) -> None:
     """Cloud and image at a camera's rate: the node may drop frames, the transport none."""
     before = {topic: peer.count(f"received.{topic}") for topic in ("points", "image")}
     cloud, image = live.cloud_of(frame, 0), live.image_of(frame, 0)

@@ -8,6 +8,7 @@ counted by its reason, shown in /diagnostics and warned of once a throttle perio
 
 from __future__ import annotations
 
+import signal
 import sys
 import threading
 import time
@@ -131,7 +132,7 @@ class SegmentationNode(LifecycleNode):
         self._configured.append(self._destroy_results)
         self._worker = Worker(self._process, "segment")
         self._configured.append(lambda: self._worker.stop(STOP_TIMEOUT_S))
-        self._inputs = Inputs(self, parameters, self.health, self._enqueue, self._reject)
+        self._inputs = Inputs(self, parameters, self.health, self._enqueue, self.reject)
         self._configured.append(self._inputs.destroy)
 
     def _tear_down(self) -> None:
@@ -176,7 +177,7 @@ class SegmentationNode(LifecycleNode):
                     )  # fmt: skip
         except Exception as error:
             if rclpy.ok():
-                self._reject(error, "frame")
+                self.reject(error, "frame")
 
     def _extrinsic_of(self, pair: Pair) -> Any:
         if self._transforms is None or pair.camera is None:
@@ -185,7 +186,8 @@ class SegmentationNode(LifecycleNode):
 
     # Health.
 
-    def _reject(self, error: Exception, where: str) -> None:
+    def reject(self, error: Exception, where: str) -> None:
+        """Count what cannot be used, and warn of it once a throttle period."""
         known = isinstance(error, RcsegError)
         reason = getattr(error, "reason", "invalid_frame") if known else f"internal_{type(error).__name__}"
         if self.health.reject(reason, str(error), self.parameters["diagnostics.warn_period_s"]):
@@ -224,8 +226,37 @@ class SegmentationNode(LifecycleNode):
         service.callback = guarded
 
 
+class _Interrupt:
+    """SIGINT as KeyboardInterrupt, but for the first while the node spins, which rclpy itself ends then.
+
+    An exception in the middle of a message's conversion would come out as a fault of that message.
+    """
+
+    def __init__(self) -> None:
+        self.spinning = False
+        signal.signal(signal.SIGINT, self._on_signal)  # before rclpy.init, which passes signals on
+
+    def _on_signal(self, number: int, stack: Any) -> None:
+        if not self.spinning:
+            signal.default_int_handler(number, stack)
+        self.spinning = False
+
+
+def _spin(executor: SingleThreadedExecutor, node: SegmentationNode) -> None:
+    """Spin until the context is shut down; what the executor raises for a message is a rejection."""
+    while rclpy.ok():
+        try:
+            executor.spin_once()
+        except ExternalShutdownException:
+            return
+        except Exception as error:
+            if rclpy.ok():
+                node.reject(error, "message")
+
+
 def main(args: list[str] | None = None) -> int:
     """Run the node until it is told to stop; exit code 0, or 2 where a parameter cannot be used."""
+    interrupt = _Interrupt()
     rclpy.init(args=args)
     node = None
     try:
@@ -233,7 +264,8 @@ def main(args: list[str] | None = None) -> int:
         executor = SingleThreadedExecutor()
         executor.add_node(node)
         node.autostart()
-        executor.spin()
+        interrupt.spinning = True
+        _spin(executor, node)
     except ConfigError as error:
         print(f"segmentation_node: {error}", file=sys.stderr)
         return 2

@@ -55,9 +55,9 @@ def region_statistics(
     axes = _right_handed_axes(covariance)
     axes[~known] = np.eye(3)
     low, high = _extents(labels, points, mean, axes, count)
-    middle = np.where(known[:, None], (low + high) / 2, np.nan)
-    center = mean + np.einsum("nij,nj->ni", axes, middle)
-    return RegionStatistics(mean_color, center, axes, np.where(known[:, None], high - low, np.nan))
+    low[~known], high[~known] = np.nan, np.nan
+    center = mean + np.einsum("nij,nj->ni", axes, (low + high) / 2)
+    return RegionStatistics(mean_color, center, axes, high - low)
 
 
 def warm_up_statistics() -> None:

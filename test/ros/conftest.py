@@ -19,6 +19,28 @@ def live():
     return module
 
 
+@pytest.fixture
+def run(live, tmp_path):
+    """Start nodes of given names, each with a peer; they end with the test, with exit code 0."""
+    started = []
+
+    def start(name, parameters=None, outputs=tuple(live.OUTPUTS), *, active=True, **peer_options):
+        process = live.NodeProcess(tmp_path / f"{name}.txt", parameters, {"__node": name})
+        if active:
+            process.wait_for_output("active")
+        peer = live.Peer(name, outputs, **peer_options)
+        started.append((process, peer))
+        return process, peer
+
+    yield start
+    for _, peer in started:
+        peer.close()
+    for process, _ in started:
+        code, _ = process.stop()
+        assert code == 0, process.output()
+        assert "Traceback" not in process.output(), process.output()
+
+
 @pytest.fixture(scope="module")
 def node(live, tmp_path_factory):
     """An active node that all tests of a module share."""

@@ -45,6 +45,13 @@ OUTPUTS = {
     "reconstruction": PointCloud2,
 }
 DOMAIN = 1 + os.getpid() % 100  # of this test run alone
+PROFILE = Path(__file__).parents[2] / "config" / "fastdds_large_messages.xml"
+ISOLATED = {
+    "ROS_DOMAIN_ID": str(DOMAIN),
+    "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+    # Without it an answer that is lost among large messages comes with the next heartbeat, 3 s later.
+    "FASTRTPS_DEFAULT_PROFILES_FILE": str(PROFILE),
+}
 FRAME_ID = "camera_color_optical_frame"
 CAMERA = PinholeCamera(180.0, 180.0, 79.5, 59.5)
 SECOND = 1_000_000_000
@@ -119,6 +126,21 @@ def stamp_of(message: Any) -> int:
     return stamp.sec * SECOND + stamp.nanosec
 
 
+def assert_same(one: Any, other: Any, path: str = "message") -> None:
+    """Equality of two messages field by field, NaN equal to NaN."""
+    if hasattr(one, "get_fields_and_field_types"):
+        for name in one.get_fields_and_field_types():
+            assert_same(getattr(one, name), getattr(other, name), f"{path}.{name}")
+    elif isinstance(one, list):
+        assert len(one) == len(other), path
+        for i, pair in enumerate(zip(one, other, strict=True)):
+            assert_same(*pair, f"{path}[{i}]")
+    elif isinstance(one, str):
+        assert one == other, path
+    else:
+        np.testing.assert_array_equal(one, other, path)
+
+
 class NodeProcess:
     """The executable segmentation_node, in a process and a session of its own."""
 
@@ -161,7 +183,7 @@ class NodeProcess:
 
 def environment() -> dict[str, str]:
     """The environment of every process of this run: own domain, nothing beyond this machine."""
-    return os.environ | {"ROS_DOMAIN_ID": str(DOMAIN), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    return os.environ | ISOLATED
 
 
 def wait_until(
@@ -183,7 +205,7 @@ class Peer:
     def __init__(
         self, node_name: str = "rcseg", outputs: tuple[str, ...] = tuple(OUTPUTS), reliable: bool = True
     ) -> None:
-        os.environ.update({k: environment()[k] for k in ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE")})
+        os.environ.update(ISOLATED)
         self._context = Context()
         rclpy.init(context=self._context)
         self.node = rclpy.create_node("peer", context=self._context)

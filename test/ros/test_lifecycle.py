@@ -14,13 +14,10 @@ T0 = 1_710_000_000 * SECOND
 
 
 @pytest.fixture
-def idle(live, tmp_path):
+def idle(run):
     """A node that was not started by itself, with its peer."""
-    process = live.NodeProcess(tmp_path / "log.txt", {"autostart": False}, {"__node": "idle"})
-    peer = live.Peer("idle")
-    yield peer, process
-    peer.close()
-    assert process.stop()[0] == 0, process.output()
+    process, peer = run("idle", {"autostart": False}, active=False)
+    return peer, process
 
 
 def test_cycles_leave_nothing_behind(live, idle):
@@ -88,28 +85,23 @@ def test_shutdown_transition_ends_the_work_not_the_process(idle):
 
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
-def test_signals_in_mid_frame(live, tmp_path, how):
-    process = live.NodeProcess(tmp_path / "log.txt", {}, {"__node": "doomed"})
-    process.wait_for_output("active")
-    peer = live.Peer("doomed", ("labels",))
+def test_signals_in_mid_frame(live, run, how):
+    process, peer = run("doomed", {}, ("labels",))
     peer.connected("points", "image", "camera_info")
     big = live.scene(height=480, width=640)
     for i in range(5):
         peer.send(big, T0 + i * SECOND)
     time.sleep(0.05)
     code, seconds = process.stop(how)
-    peer.close()
     assert code == 0, process.output()
     assert seconds < 2.0
     assert "Traceback" not in process.output()
 
 
-def test_signal_while_unconfigured(live, tmp_path):
-    process = live.NodeProcess(tmp_path / "log.txt", {"autostart": False}, {"__node": "sleeper"})
-    peer = live.Peer("sleeper", ())
+def test_signal_while_unconfigured(run):
+    process, peer = run("sleeper", {"autostart": False}, (), active=False)
     assert peer.state() == "unconfigured"
     code, seconds = process.stop(signal.SIGTERM)
-    peer.close()
     assert code == 0 and seconds < 2.0, process.output()
 
 

@@ -39,32 +39,23 @@ def test_every_output_carries_the_inputs_stamp_and_frame(live, peer, frame, labe
     assert {m.ns for m in outputs["markers"].markers} >= {"surfaces", "boxes", "normals", "labels"}
 
 
-def test_depth_and_image(live, peer, labels, frame, node_of_depth):
-    node_peer, stamp = node_of_depth, next(stamps)
-    node_peer.publish(camera_info=live.camera_info_of(frame, stamp))
-    node_peer.publish(depth=live.depth_of(frame, stamp), image=live.image_of(frame, stamp))
-    np.testing.assert_array_equal(live.image_array(node_peer.wait_for("labels", stamp)), labels)
+def test_depth_and_image(live, run, labels, frame):
+    """A second node: auto takes the first range topic that speaks."""
+    _, peer = run("of_depth", {}, ("labels",))
+    peer.connected("depth", "image", "camera_info")
+    stamp = next(stamps)
+    peer.publish(camera_info=live.camera_info_of(frame, stamp))
+    peer.publish(depth=live.depth_of(frame, stamp), image=live.image_of(frame, stamp))
+    np.testing.assert_array_equal(live.image_array(peer.wait_for("labels", stamp)), labels)
     stamp = next(stamps)
     millimetres = np.nan_to_num(frame.depth_m * 1000).round().astype(np.uint16)
     message = live.depth_of(frame, stamp)
     message.encoding, message.step, message.data = "16UC1", frame.width * 2, millimetres.tobytes()
-    node_peer.publish(depth=message, image=live.image_of(frame, stamp))
+    peer.publish(depth=message, image=live.image_of(frame, stamp))
     rounded = millimetres.astype(np.float32) * np.float32(0.001)
     rounded[millimetres == 0] = np.nan
     expected = live.expected_labels(RangeColorFrame.from_depth(rounded, frame.color, live.CAMERA))
-    np.testing.assert_array_equal(live.image_array(node_peer.wait_for("labels", stamp)), expected)
-
-
-@pytest.fixture
-def node_of_depth(live, tmp_path):
-    """A second node under another name: auto takes the first range topic that speaks."""
-    process = live.NodeProcess(tmp_path / "log.txt", {}, {"__node": "of_depth"})
-    process.wait_for_output("active")
-    peer = live.Peer("of_depth", ("labels",))
-    peer.connected("depth", "image", "camera_info")
-    yield peer
-    peer.close()
-    assert process.stop()[0] == 0, process.output()
+    np.testing.assert_array_equal(live.image_array(peer.wait_for("labels", stamp)), expected)
 
 
 def _bayer(color: np.ndarray) -> np.ndarray:
@@ -146,23 +137,17 @@ def test_patches_of_a_received_message_are_the_cores(live, peer, frame):
         assert tuple(message.neighbors) == tuple(region.neighbors)
 
 
-def test_colour_of_the_cloud_alone(live, frame, labels, tmp_path):
-    process = live.NodeProcess(tmp_path / "log.txt", {"input.color_from": "cloud"}, {"__node": "of_cloud"})
-    process.wait_for_output("active")
-    peer = live.Peer("of_cloud", ("labels", "regions"))
+def test_colour_of_the_cloud_alone(live, frame, labels, run):
+    _, peer = run("of_cloud", {"input.color_from": "cloud"}, ("labels", "regions"))
     peer.connected("points", "camera_info")
     stamp = next(stamps)
     peer.publish(camera_info=live.camera_info_of(frame, stamp))
     peer.publish(points=live.cloud_of(frame, stamp))
     np.testing.assert_array_equal(live.image_array(peer.wait_for("labels", stamp)), labels)
-    peer.close()
-    assert process.stop()[0] == 0, process.output()
 
 
-def test_a_scanner_grid_without_camera(live, frame, tmp_path):
-    process = live.NodeProcess(tmp_path / "log.txt", {"input.camera": "none"}, {"__node": "of_scanner"})
-    process.wait_for_output("active")
-    peer = live.Peer("of_scanner", ("labels", "regions"))
+def test_a_scanner_grid_without_camera(live, frame, run):
+    _, peer = run("of_scanner", {"input.camera": "none"}, ("labels", "regions"))
     peer.connected("points", "image")
     stamp = next(stamps)
     peer.send(frame, stamp, camera=False)
@@ -170,5 +155,3 @@ def test_a_scanner_grid_without_camera(live, frame, tmp_path):
     np.testing.assert_array_equal(live.image_array(peer.wait_for("labels", stamp)), expected)
     array = peer.wait_for("regions", stamp)
     assert array.k[0] == 0 and array.regions[0].range_patch.kind == 2
-    peer.close()
-    assert process.stop()[0] == 0, process.output()

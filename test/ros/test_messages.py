@@ -1,0 +1,162 @@
+"""RegionArray: the same from both message libraries, and enough to evaluate, draw and cut the regions."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from rcseg_core import PinholeCamera, RangeColorFrame, SegmenterConfig, segment
+from rcseg_ros.conversions import Header
+from rcseg_ros.messages import region_array
+from rcseg_ros.outputs import header_message
+from rcseg_ros.patches import evaluate_patch, surface_points
+from rcseg_ros.region_statistics import region_statistics
+from rcseg_ros.result_bag import make_message, serialize
+
+MSG = Path(__file__).parents[2] / "rcseg_msgs" / "msg"
+
+
+@pytest.fixture(scope="module", params=["camera", "scanner"])
+def case(request):
+    """(frame, result, message as rosbags makes it)."""
+    cols = np.arange(120) + np.zeros((90, 1))
+    depth_m = (1 / (0.5 + 0.002 * cols)).astype(np.float32)
+    depth_m[30:60, 20:50] = 1.1
+    depth_m += np.random.default_rng(0).normal(0, 0.001, depth_m.shape).astype(np.float32)
+    color = np.where((cols < 70)[..., None], (60, 90, 120), (180, 150, 90)).astype(np.uint8)
+    frame = RangeColorFrame.from_depth(depth_m, color, PinholeCamera(130.0, 130.0, 59.5, 44.5))
+    if request.param == "scanner":
+        frame = RangeColorFrame(frame.points, frame.color)
+    result = segment(frame, SegmenterConfig())
+    return (
+        frame,
+        result,
+        region_array(frame, result, header_message(Header(5, "f"), make_message), make_message),
+    )
+
+
+def test_every_field_is_commented():
+    for path in MSG.glob("*.msg"):
+        lines = path.read_text().splitlines()
+        for i, line in enumerate(lines):
+            if re.match(r"[a-z]\w*(/\w+)?(\[\d*\])?\s+[a-z]", line):
+                documented = "#" in line or path.stem == "PixelBox"  # its head says all
+                assert documented, f"{path.name}:{i + 1}: {line}"
+
+
+def test_one_region_a_label_in_order(case):
+    frame, result, message = case
+    assert (message.height, message.width) == result.labels.shape
+    assert [r.label for r in message.regions] == list(range(1, len(result.regions) + 1))
+    assert message.k[0] == (frame.camera.fx if frame.camera else 0.0)
+    for region in message.regions:
+        inside = result.labels == region.label
+        assert region.pixel_count == inside.sum()
+        rows, cols = np.nonzero(inside)
+        box = region.pixels
+        assert (box.row_min, box.col_min, box.row_max, box.col_max) == (
+            rows.min(),
+            cols.min(),
+            rows.max(),
+            cols.max(),
+        )
+        assert set(np.unique(result.surface_labels[inside])) == {region.surface}
+
+
+def test_patches_evaluate_from_the_message_alone(case):
+    frame, result, message = case
+    rows, cols = np.mgrid[0 : frame.height : 5, 0 : frame.width : 5]
+    for region, core in zip(message.regions, result.regions, strict=True):
+        for one, other in ((region.range_patch, core.range_patch), (region.color_patch, core.color_patch)):
+            np.testing.assert_allclose(
+                evaluate_patch(one, rows, cols), other.evaluate(rows, cols), rtol=1e-9, atol=1e-9
+            )
+        inside = result.labels[rows, cols] == region.label
+        points, _ = result.reconstruct()
+        surface = surface_points(message, region, rows[inside], cols[inside])
+        np.testing.assert_allclose(surface, points[rows[inside], cols[inside]], atol=2e-4)
+
+
+def test_noise_and_uncertainty_have_the_scale_of_the_scene(case):
+    frame, _, message = case
+    region = message.regions[0]
+    depth_m = region.centroid.z
+    sigma_m = region.range_patch.noise_sigma[-1] * (depth_m**2 if frame.camera else 1.0)
+    assert 0.0003 < sigma_m < 0.004  # 1 mm was added
+    assert np.all(np.asarray(region.range_patch.standard_errors) < 10 * region.range_patch.noise_sigma[-1])
+
+
+def test_both_message_libraries_give_the_same_message(live, case):
+    from rclpy.serialization import deserialize_message
+
+    from rcseg_msgs.msg import RegionArray
+    from rcseg_ros.messages import make_rcl
+
+    frame, result, message = case
+    of_rclpy = region_array(frame, result, header_message(Header(5, "f"), make_rcl), make_rcl)
+    live.assert_same(deserialize_message(bytes(serialize(message)), RegionArray), of_rclpy)
+
+
+def test_the_merge_tree_cuts_as_the_core_does(case):
+    _, result, message = case
+    parent, height = message.hierarchy.parent, message.hierarchy.height
+    count = len(message.regions)
+    assert np.all(height[:count] == 1) and np.all(np.diff(height[count:]) >= 0)
+    assert all(p == 0 or p > n for n, p in enumerate(parent, start=1))
+    for level in (1.0, 2.0, 16.0):
+        tops = []
+        for node in range(1, count + 1):
+            while parent[node - 1] and height[parent[node - 1] - 1] <= level:
+                node = int(parent[node - 1])
+            tops.append(node)
+        image = np.concatenate([[0], tops])[result.labels]
+        expected = result.labels_at(level)
+        pairs = {(int(a), int(b)) for a, b in zip(image.ravel(), expected.ravel(), strict=True)}
+        assert len(pairs) == len({a for a, _ in pairs}) == len({b for _, b in pairs}), "another partition"
+
+
+def test_statistics_of_a_known_box():
+    """A slab of 2 x 1 x 0.1 m, turned; its points fill the image."""
+    rng = np.random.default_rng(0)
+    local = rng.uniform(-0.5, 0.5, (60, 80, 3)) * (2.0, 1.0, 0.1)
+    angle = np.deg2rad(30)
+    turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    points = (local @ turn.T + (0.3, -0.2, 4.0)).astype(np.float32)
+    points[0, 0] = np.nan
+    labels = np.ones((60, 80), np.int32)
+    labels[:, 40:] = 2
+    points[:, 40:] = np.nan
+    color = np.full((60, 80, 3), (10, 20, 30), np.uint8)
+    statistics = region_statistics(labels, points, color, 2)
+    np.testing.assert_allclose(statistics.size[0], (2.0, 1.0, 0.1), rtol=0.1)
+    np.testing.assert_allclose(statistics.center[0], (0.3, -0.2, 4.0), atol=0.02)
+    np.testing.assert_allclose(abs(statistics.axes[0].T @ turn), np.eye(3), atol=0.05)
+    assert np.linalg.det(statistics.axes[0]) == pytest.approx(1)
+    assert statistics.axes[0][2, 2] < 0, "z towards the sensor"
+    np.testing.assert_allclose(statistics.mean_color, [(10, 20, 30)] * 2)
+    assert np.isnan(statistics.size[1]).all() and np.isnan(statistics.center[1]).all()
+    np.testing.assert_array_equal(statistics.axes[1], np.eye(3))
+
+
+def test_markers_draw_every_region(case):
+    from rcseg_ros.markers import marker_array
+
+    _, result, message = case
+
+    def make(type_name, **fields):
+        return SimpleNamespace(type_name=type_name, **fields)
+
+    first, *markers = marker_array(message, result.labels, make).markers
+    assert first.action == 3, "what was drawn before is deleted"
+    for region in message.regions:
+        mine = {m.ns: m for m in markers if m.id == region.label}
+        assert mine.keys() == {"surfaces", "boxes", "normals", "labels"}
+        assert len(mine["boxes"].points) == 24 and len(mine["normals"].points) == 2
+        corners = np.array([(p.x, p.y, p.z) for p in mine["surfaces"].points])
+        assert len(corners) % 3 == 0
+        center = np.array([region.centroid.x, region.centroid.y, region.centroid.z])
+        assert np.linalg.norm(corners.mean(axis=0) - center) < 0.2
