@@ -53,6 +53,7 @@ def test_services_answer_while_frames_are_in_work(live, run):
 def test_outputs_without_listeners_are_not_computed(live, monkeypatch):
     from rcseg_core import SegmenterConfig, segment
     from rcseg_ros import publishers
+    from rcseg_ros import results as results_module
     from rcseg_ros.conversions import Header
 
     made = []
@@ -75,8 +76,9 @@ def test_outputs_without_listeners_are_not_computed(live, monkeypatch):
     def refuse(*_):
         raise AssertionError("computed for nobody")
 
-    for name in ("overlay", "marker_array", "region_array", "cloud_message", "edges_message"):
-        monkeypatch.setattr(publishers, name, refuse)
+    for name in ("overlay", "region_array", "cloud_message", "edges_message"):
+        monkeypatch.setattr(results_module, name, refuse)
+    monkeypatch.setattr(publishers, "marker_array", refuse)
     frame = live.scene()
     result = segment(frame, SegmenterConfig())
     told = []
