@@ -219,6 +219,10 @@ class AbsorptionConfig:
         120, "regions below this whose pixels a neighbour predicts dissolve into it", unit="px at 640x480",
         low=1, high=100000,
     )  # fmt: skip
+    small_region: int = _param(
+        500, "regions below this are absorbed whole where a neighbour predicts them within the tolerance",
+        unit="px at 640x480", low=0, high=100000,
+    )  # fmt: skip
     refine_passes: int = _param(
         2, "passes in which boundary pixels move to the neighbour that predicts them better", low=0, high=20
     )

@@ -6,6 +6,7 @@ The first term is what noise alone costs when m pixels make one independent meas
 largest ratio of left to right, so 1 is the limit and the measure is symmetric.
 chow: the same for the total rise of both sides at once.
 bayes: c_ib of eq. (21), the larger region predicts the smaller (the other way extrapolation explodes).
+Small regions are also absorbed like points (step 3): where the larger one predicts them within the tolerance.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from rcseg_core.moments import UNIT_PX, Moments, mean_square_gradient, residual,
 from rcseg_core.planes import joint_shape, joint_signal, rise
 from rcseg_core.signals import local_scales
 
-BOUNDED, CHOW, BAYES = 0, 1, 2
+BOUNDED, CHOW, BAYES, POINTS = 0, 1, 2, 3
 #: Steeper than this (tan^2) a surface is hardly measured: the tolerance along the ray grows no further.
 MAX_TAN2 = 8.0
 KINDS = {"bounded": BOUNDED, "chow": CHOW, "bayes": BAYES}
@@ -29,10 +30,11 @@ KINDS = {"bounded": BOUNDED, "chow": CHOW, "bayes": BAYES}
 class Rule(NamedTuple):
     """What a comparison goes by, the same for all pairs of a pass.
 
-    kind : BOUNDED, CHOW or BAYES; n_range, channels : int; law, color_eps2 : see Signals;
+    kind : BOUNDED, CHOW, BAYES or POINTS; n_range, channels : int; law, color_eps2 : see Signals;
     share2 : squared noise share; relief2 : squared relief tolerance;
     correlation : pixels an independent measurement, of range and of colour;
     slope : gradient (whitened, per UNIT_PX) of a surface tilted by 45 degrees, as a + b s of the signal; beta2 : beta^2 of eq. (20); use_range, use_color : whether a modality counts;
+    small : pixels below which a region may be absorbed like a point, for POINTS;
     terms : exponents of the models by degree, (p, 2) int64 each; terms[1] is a plane or the bilinear form;
     degree : (N + 1, 2) int64, degree of range and colour of each region; a pair takes the higher of the two (step 6)
     """
@@ -49,6 +51,7 @@ class Rule(NamedTuple):
     beta2: float
     use_range: bool
     use_color: bool
+    small: float
     terms: tuple[NDArray[np.int64], ...]
     degree: NDArray[np.int64]
 
@@ -313,6 +316,36 @@ def _bayes(moments, big, small, rule, own, boxes, work):  # type: ignore[no-unty
 
 
 @bare
+def _predicted(moments, big, small, rule, gate_r, gate_c, work):  # type: ignore[no-untyped-def]
+    """Mean squared residual of a small region under the model of the larger, over noise and tolerance.
+
+    The tolerance along the ray grows with the slope of the larger model over the small region, as in
+    `earned_tolerance`: slivers at the limb of a ball are near its model in space though not along the ray.
+    """
+    n = moments.power[small, 0, 0]
+    worst = 0.0
+    for modality in range(2):
+        if (modality == 0 and not rule.use_range) or (modality == 1 and not rule.use_color):
+            continue
+        first, last = channel_span(rule, modality)
+        degree = rule.degree[big, modality]
+        terms = rule.terms[degree]
+        solve(moments.power[big], moments.cross[big], first, last, terms, work.gram, work.coef)
+        mean2 = residual(work.power, work.cross, moments.energy[small], first, last, terms, work.coef) / n
+        if modality == 0:
+            var, eps2 = local_scales(rule.law, work.cross[0, 0, 0] / n)
+            eps2 *= gate_r * gate_r
+            if degree > 1:
+                flat = rule.slope[0] + rule.slope[1] * work.cross[0, 0, 0] / n
+                steepness = mean_square_gradient(work.power, terms, work.coef[last - 1])
+                eps2 *= 1.0 + min(steepness / (flat * flat), MAX_TAN2)
+        else:
+            var, eps2 = 1.0, rule.color_eps2 * gate_c * gate_c
+        worst = max(worst, mean2 / ((last - first) * var + eps2))
+    return np.sqrt(worst)
+
+
+@bare
 def compare(moments, i, j, rule, own, boxes, gate_r, gate_c, work):  # type: ignore[no-untyped-def]
     """Compare two regions.
 
@@ -334,6 +367,11 @@ def compare(moments, i, j, rule, own, boxes, gate_r, gate_c, work):  # type: ign
         for a in range(low):
             for b in range(low):
                 work.sum_cross[c, a, b] = moments.cross[big, c, a, b] + work.cross[c, a, b]
+    if rule.kind == POINTS:
+        if moments.power[small, 0, 0] >= rule.small:
+            return np.inf, np.inf, False
+        value = _predicted(moments, big, small, rule, gate_r, gate_c, work)
+        return value, value, value <= 1.0
     if rule.kind == BAYES:
         value, height = _bayes(moments, big, small, rule, own, boxes, work)
         return value, height, height <= 1.0

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rcseg_core.adjacency import Pairs
-from rcseg_core.evidence import BAYES, Rule, Work, compare, compare_planes, make_work, move, own_residuals
+from rcseg_core.evidence import BOUNDED, CHOW, Rule, Work, compare, compare_planes, make_work, move, own_residuals
 from rcseg_core.jit import bare
 from rcseg_core.moments import Moments
 from rcseg_core.planes import Planes, add_planes, center_planes
@@ -404,7 +404,7 @@ def group(
     Grouped
     """
     count, channels = moments.energy.shape
-    flat = rule.kind != BAYES and len(rule.terms[1]) == 3 and not (rule.degree[1:] > 1).any()
+    flat = rule.kind in (BOUNDED, CHOW) and len(rule.terms[1]) == 3 and not (rule.degree[1:] > 1).any()
     planes = center_planes(moments) if flat else Planes(np.empty((0, 6)), np.empty((0, channels, 5)))
     state = State(
         flat, moments, planes, np.ones((count, 4)), boxes, rule, make_work(moments), np.empty(6),

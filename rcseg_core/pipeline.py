@@ -21,7 +21,7 @@ from rcseg_core.reflectance import normalize_reflectance
 from rcseg_core.seeds import initial_partition
 from rcseg_core.segmentation import Segmentation, compact
 from rcseg_core.signals import INVALID, Signals, build_signals
-from rcseg_core.stages import coarser_groups, final_degrees, group_pass, measure, surfaces_of
+from rcseg_core.stages import absorb_small, coarser_groups, final_degrees, group_pass, measure, surfaces_of
 
 
 #: Rounds of regrouping after the points are settled; two are seldom needed.
@@ -149,6 +149,7 @@ def partition_by(
         for _ in range(MAX_ROUNDS):
             before = partition.count
             group_pass(partition, signals, edges, degrees(config, signals)[-1], config)
+            absorb_small(partition, signals, edges, degrees(config, signals)[-1], config)
             clock.lap(f"{name} regroup")
             if partition.count == before:
                 break

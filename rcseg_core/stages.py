@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 
 from rcseg_core.adjacency import Pairs, find_pairs
 from rcseg_core.config import SegmenterConfig
-from rcseg_core.evidence import KINDS, Rule
+from rcseg_core.continuity import continuous_pairs
+from rcseg_core.evidence import KINDS, POINTS, Rule
 from rcseg_core.generalization import choose_degrees
 from rcseg_core.grouping import add_merged, group
 from rcseg_core.models import Models, fit_models
@@ -46,6 +47,7 @@ def make_rule(
         beta2=config.grouping.prior_beta**2,
         use_range=signals.n_range > 0,
         use_color=use_color and signals.image.shape[2] > signals.n_range,
+        small=config.absorption.small_region * signals.flags.size / (640 * 480),
         terms=terms,
         degree=degree,
     )
@@ -94,6 +96,27 @@ def group_pass(
     alive = partition.apply(grouped)
     kept = Moments(*(a[alive] for a in moments))
     return fit_models(kept, rule.degree[alive], signals.n_range, planes)
+
+
+def absorb_small(
+    partition: Partition, signals: Signals, edges: NDArray[np.uint8], degree: int, config: SegmenterConfig
+) -> None:
+    """Step 3 for small regions: absorbed whole, like points, where a larger neighbour predicts or continues them."""
+    boxes, pairs = measure(partition, edges, config)
+    moments = accumulate(signals.image, signals.flags, partition.labels, partition.count, degree)
+    start = np.ones((partition.count + 1, 2), np.int64)
+    degrees = choose_degrees(
+        moments, signals.n_range, start, noise_variance(moments, signals), correlation(signals),
+        config.generalization, highest=degree,
+    )  # fmt: skip
+    rule = make_rule(signals, degrees, config, planes=False)._replace(kind=POINTS)
+    alive = partition.apply(group(moments, boxes, pairs, rule, config.grouping.edge_gate))
+    if signals.n_range != signals.image.shape[2]:
+        return  # continuity says nothing about colour
+    kept = Moments(*(a[alive] for a in moments))
+    models = fit_models(kept, rule.degree[alive], signals.n_range)
+    boxes, pairs = measure(partition, edges, config)
+    partition.apply(continuous_pairs(partition.labels, signals, models, pairs))
 
 
 def final_degrees(
