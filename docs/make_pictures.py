@@ -37,7 +37,7 @@ def main() -> None:
             (f"{result.surface_labels.max()} surfaces", overlay(frame.color, result.surface_labels)),
             ("reconstructed from the parameters alone", color),
         ]
-        sheet = contact_sheet(panels, columns=3, panel_width=400)
+        sheet = contact_sheet(panels, columns=3, panel_width=320)
         write_png(HERE / "pictures" / f"{name}.png", sheet)
 
 
