@@ -37,7 +37,7 @@ def marker_array(array: Any, labels: NDArray[np.int32], make: Make) -> Any:
         color = np.asarray(region.mean_color) / 255.0
         drawn = (
             ("surfaces", TRIANGLES, _mesh(array, region, labels), color, 0.9),
-            ("boxes", LINE_LIST, _box_edges(region), color, 0.8),
+            ("boxes", LINE_LIST, box_edges(region), color, 0.8),
             ("normals", ARROW, _arrow(region), np.array([1.0, 1.0, 0.2]), 1.0),
         )
         for name, kind, points, rgb, alpha in drawn:
@@ -63,7 +63,7 @@ def _mesh(array: Any, region: Any, labels: NDArray[np.int32]) -> NDArray[np.floa
     return cells[np.isfinite(cells).all(axis=(1, 2))].reshape(-1, 3)
 
 
-def _box_edges(region: Any) -> NDArray[np.float64]:
+def box_edges(region: Any) -> NDArray[np.float64]:
     """(24, 3) ends of the twelve edges of the oriented box."""
     pose, size = region.extent_pose, region.extent_size
     orientation = pose.orientation

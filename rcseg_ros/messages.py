@@ -37,7 +37,7 @@ def region_array(frame: RangeColorFrame, result: Segmentation, header: Any, make
     -------
     rcseg_msgs/RegionArray, as `make` builds it
     """
-    statistics = region_statistics(result.labels, frame.points, frame.color, len(result.regions))
+    statistics = region_statistics(frame, result.labels, result.regions)
     quaternions = Rotation.from_matrix(statistics.axes).as_quat() if len(result.regions) else np.empty((0, 4))
     regions = []
     for i, region in enumerate(result.regions):

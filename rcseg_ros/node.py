@@ -32,7 +32,6 @@ from rcseg_ros.inputs import Inputs
 from rcseg_ros.messages import make_rcl
 from rcseg_ros.parameters import NodeParameters
 from rcseg_ros.publishers import ResultPublishers
-from rcseg_ros.region_statistics import warm_up_statistics
 from rcseg_ros.sync import Pair
 from rcseg_ros.warmup import warm_up
 from rcseg_ros.worker import Worker
@@ -127,7 +126,6 @@ class SegmentationNode(LifecycleNode):
             self._transforms = TransformListener(self)
             self._configured.append(self._transforms.destroy)
         self.get_logger().info(f"configured in {warm_up(parameters.config, self.get_logger().info):.1f} s")
-        warm_up_statistics()
         self._results = ResultPublishers(self)
         self._configured.append(self._destroy_results)
         self._worker = Worker(self._process, "segment")
