@@ -74,20 +74,18 @@ def segment(
         if config.grouping.order == "surfaces_first":
             partition = partition_by(signals.color_only(), edges, config, surfaces.labels, clock, "color")
 
-    surface_of = partition.groups()
-    partition.within = None
-    if config.absorption.enabled:
-        models = final_models(partition, signals, config)[1]
-        refine(signals, partition.labels, partition.leaves, models, config.absorption.refine_passes)
-    order = partition.sort_by_size()
+    # the two linked: both signals together decide what small regions and border pixels belong to
+    if config.absorption.enabled and config.grouping.order == "surfaces_first":
+        partition.within = None
+        settle(partition, signals, config)
+        absorb_small(partition, signals, edges, degrees(config, signals)[-1], config)
+    partition.sort_by_size()
     moments, models = final_models(partition, signals, config)
     boxes, pairs = measure(partition, edges, config)
-    if config.grouping.order == "joint":
+    if surfaces is None:
         surface_of = surfaces_of(partition, signals, moments, boxes, pairs, config)
-    elif surface_of is None:
-        surface_of = np.arange(partition.count + 1)
     else:
-        surface_of = surface_of[order]
+        surface_of = majority(partition, surfaces)
     surface_labels, surface_of = number_surfaces(partition, surface_of)
     clock.lap("models")
     regions = describe_regions(
@@ -178,6 +176,13 @@ def settle(partition: Partition, signals: Signals, config: SegmenterConfig) -> N
         refine(signals, partition.labels, partition.leaves, models, config.absorption.refine_passes)
     else:  # small parts of `within` that no region reached
         partition.add_leftovers(partition.within > 0, 1)
+
+
+def majority(partition: Partition, surfaces: Partition) -> NDArray[np.int64]:
+    """(count + 1,) the surface that holds most of each region's pixels (the lowest of equals)."""
+    keys = partition.labels.astype(np.int64) * (surfaces.count + 1) + surfaces.labels
+    counts = np.bincount(keys.ravel(), minlength=(partition.count + 1) * (surfaces.count + 1))
+    return np.argmax(counts.reshape(partition.count + 1, -1), axis=1)
 
 
 def number_surfaces(
