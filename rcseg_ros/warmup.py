@@ -13,7 +13,6 @@ from time import perf_counter
 import numpy as np
 
 from rcseg_core import PinholeCamera, RangeColorFrame, SegmenterConfig, segment
-from rcseg_ros.region_statistics import warm_up_statistics
 
 _PATIENCE_S, _BEAT_S = 3.0, 10.0
 
@@ -38,7 +37,6 @@ def warm_up(config: SegmenterConfig, announce: Callable[[str], None]) -> float:
     reporter.start()
     try:
         segment(_small_scene(), config)
-        warm_up_statistics()
     finally:
         done.set()
         reporter.join()
