@@ -22,6 +22,8 @@ from rcseg_core.signals import Signals, local_scales
 MAX_ANGLE_RAD = np.deg2rad(25.0)
 #: Only a neighbour of at most this share of the pixels is taken in.
 MAX_SHARE = 0.5
+#: A sliver is too narrow for its own slope to be known: its border must be free of edges and near in position.
+MAX_SLIVER_CROSSED, MAX_SLIVER_DISTANCE2 = 0.3, 2.5
 
 
 @bare
@@ -82,12 +84,13 @@ def _border(labels, slot, models, c, law, slope, out):  # type: ignore[no-untype
 
 
 def continuous_pairs(
-    labels: NDArray[np.int32], signals: Signals, models: Models, pairs: Pairs
+    labels: NDArray[np.int32], signals: Signals, models: Models, pairs: Pairs, sliver_px: float
 ) -> Grouped:
     """The groupings that continuity asks for, the smoothest first; each region is taken in at most once.
 
     Parameters
     ----------
+    sliver_px : smaller neighbours are judged by their position alone
     labels : (H, W) int32; models : fitted to its regions, curved where the range degree is above 1
     """
     count = models.degree.shape[0] - 1
@@ -106,7 +109,10 @@ def continuous_pairs(
         _border(labels, slot, models, signals.n_range - 1, signals.law, signals.slope, sums)
         with np.errstate(invalid="ignore", divide="ignore"):
             distance2, angle = sums[:, 0] / sums[:, 2], sums[:, 1] / sums[:, 2]
-        smooth = np.nonzero((distance2 <= 1.0) & (angle <= MAX_ANGLE_RAD))[0]
+            crossed = pairs.range_crossed[rows] / pairs.boundary[rows]
+        sliver = (sizes[small[rows]] < sliver_px) & (crossed <= MAX_SLIVER_CROSSED)
+        near = distance2 <= np.where(sliver, MAX_SLIVER_DISTANCE2, 1.0)
+        smooth = np.nonzero(near & (sliver | (angle <= MAX_ANGLE_RAD)))[0]
         taken = np.zeros(count + 1, np.bool_)
         for p in smooth[np.argsort(angle[smooth], kind="stable")]:
             keep, gone = int(big[rows[p]]), int(small[rows[p]])

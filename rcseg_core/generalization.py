@@ -18,7 +18,7 @@ from rcseg_core.jit import kernel
 from rcseg_core.moments import Moments, residual, solve, tensor_exponents
 
 #: A model needs this many pixels a coefficient, or it follows the noise.
-PIXELS_PER_COEFFICIENT = 3
+PIXELS_PER_COEFFICIENT = 8
 
 
 @kernel

@@ -116,7 +116,7 @@ def absorb_small(
     kept = Moments(*(a[alive] for a in moments))
     models = fit_models(kept, rule.degree[alive], signals.n_range)
     boxes, pairs = measure(partition, edges, config)
-    partition.apply(continuous_pairs(partition.labels, signals, models, pairs))
+    partition.apply(continuous_pairs(partition.labels, signals, models, pairs, rule.small))
 
 
 def final_degrees(
