@@ -41,7 +41,7 @@ setup(
     ],
     # The message definitions travel with the Python package, to write result bags without built ones.
     package_dir={"rcseg_ros.msg": "rcseg_msgs/msg"},
-    package_data={"rcseg_ros.msg": ["*.msg"], "rcseg_core": ["py.typed"]},
+    package_data={"rcseg_ros.msg": ["*.msg"], "rcseg_core": ["py.typed"], "rcseg_ros": ["page.html"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{ROS_PACKAGE}"]),
         (f"share/{ROS_PACKAGE}", ["package.xml"]),
@@ -64,6 +64,7 @@ setup(
     extras_require={
         "test": ["pytest>=8.0", "hypothesis>=6.90", "mcap-ros2-support>=0.5", "imgviz>=2.0"],
         "dev": ["ruff>=0.6", "mypy>=1.10", "import-linter>=2.0", "codespell>=2.2", "pre-commit>=3.5"],
+        "view": ["foxglove-sdk>=0.16"],
         "ros": ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"],
         # What `colcon build` needs of a ROS installation, as wheels: only to test that build.
         "colcon": [

@@ -216,6 +216,41 @@ def inspect(
     inspect_bag(result, frame, CONSOLE)
 
 
+@app.command(epilog="Example: `rcseg view bags/tabletop`, then open the address in a browser")
+def view(
+    bag: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Argument(
+            help="Recording or result bag; without one the topics of a running node.", show_default=False
+        ),
+    ] = None,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Of the page; 0: any free one.")] = 8080,
+    foxglove: Annotated[
+        Optional[int],  # noqa: UP045
+        typer.Option(
+            min=0, max=65535, help="Serve Foxglove and Lichtblick on this port too, for example 8765."
+        ),
+    ] = None,
+    host: Annotated[
+        str, typer.Option(help="Address to serve on; 0.0.0.0: for other machines.")
+    ] = "127.0.0.1",
+    rate: Annotated[
+        float, typer.Option(min=0.01, max=1000, help="Most frames a second, of a recording.")
+    ] = 2.0,
+    once: Annotated[bool, typer.Option("--once", help="Do not begin again at the end.")] = False,
+    node: Annotated[str, typer.Option(help="Name of the node, where its topics lie.")] = "/rcseg",
+    config: ConfigFile = None,
+    set_: Settings = None,
+) -> None:
+    """Show regions, labels and the reconstruction in a browser, or in Foxglove. Ctrl-C ends it."""
+    from rcseg_ros.settings import load_config
+    from rcseg_ros.terminal import run_view
+    from rcseg_ros.view import ViewRequest
+
+    request = ViewRequest(bag, load_config(config, set_ or ()), node, rate, loop=not once)
+    raise typer.Exit(run_view(request, host, port, foxglove))
+
+
 def _bad_input(text: str) -> Exception:
     from rcseg_core.errors import InputError
 

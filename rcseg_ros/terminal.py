@@ -17,6 +17,8 @@ from rcseg_core.config import describe
 from rcseg_core.errors import InputError
 from rcseg_ros.replay import ReplayRequest, ReplaySummary, replay
 from rcseg_ros.settings import bounds
+from rcseg_ros.view import Viewer, ViewRequest, view
+from rcseg_ros.viewers import FoxgloveViewer, PageViewer
 from rcseg_ros.warmup import warm_up
 
 INTERRUPTED = 130  # exit code after Ctrl-C
@@ -44,6 +46,28 @@ def run_replay(request: ReplayRequest) -> int:
     if summary.damage:
         saved = f"{_count(len(summary.frames), 'frame')} before it written to {request.output}"
         raise InputError(f"{'; '.join(summary.damage)}; {saved}")
+    return 0
+
+
+def run_view(request: ViewRequest, host: str, port: int, foxglove_port: int | None) -> int:
+    """Serve the views until Ctrl-C, or until the recording has been shown once; return the exit code."""
+    if request.bag is not None and not request.bag.exists():
+        raise InputError(f"{request.bag}: no such file or folder")
+    viewers: list[Viewer] = [PageViewer(host, port)]
+    try:
+        if foxglove_port is not None:
+            viewers.append(FoxgloveViewer(host, foxglove_port, request.node))
+        if request.bag is not None:
+            prepare(request.config)
+        for viewer in viewers:
+            CONSOLE.print(f"Serving {viewer.address}", highlight=True)
+        CONSOLE.print("Ctrl-C ends it")
+        view(request, viewers, lambda text: _PROGRESS.print(text, soft_wrap=True))
+    except KeyboardInterrupt:
+        pass  # the way to end a view
+    finally:
+        for viewer in viewers:
+            viewer.close()
     return 0
 
 
