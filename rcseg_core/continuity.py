@@ -84,23 +84,24 @@ def _border(labels, slot, models, c, law, slope, out):  # type: ignore[no-untype
 
 
 def continuous_pairs(
-    labels: NDArray[np.int32], signals: Signals, models: Models, pairs: Pairs, sliver_px: float
-) -> Grouped:
+    labels: NDArray[np.int32], signals: Signals, models: Models, pairs: Pairs, curved: NDArray[np.bool_],
+    sliver_px: float,
+) -> Grouped:  # fmt: skip
     """The groupings that continuity asks for, the smoothest first; each region is taken in at most once.
 
     Parameters
     ----------
     sliver_px : smaller neighbours are judged by their position alone
-    labels : (H, W) int32; models : fitted to its regions, curved where the range degree is above 1
+    labels : (H, W) int32; models : fitted to its regions
+    curved : (N + 1,) bool, regions whose relief exceeds the tolerance
     """
     count = models.degree.shape[0] - 1
     sizes = np.bincount(labels.ravel(), minlength=count + 1)
     a, b = pairs.nodes.T
     big = np.where(sizes[a] >= sizes[b], a, b)
     small = a + b - big
-    curved = (models.degree[big, 0] > 1) & (sizes[small] <= MAX_SHARE * sizes[big])
     # only pairs in question get a slot of the table
-    rows = np.nonzero(curved)[0]
+    rows = np.nonzero(curved[big] & (sizes[small] <= MAX_SHARE * sizes[big]))[0]
     merges: list[tuple[int, int]] = []
     if rows.size:
         slot = np.full((count + 1, count + 1), -1, np.int32)

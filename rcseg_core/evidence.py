@@ -36,7 +36,8 @@ class Rule(NamedTuple):
     slope : gradient (whitened, per UNIT_PX) of a surface tilted by 45 degrees, as a + b s of the signal; beta2 : beta^2 of eq. (20); use_range, use_color : whether a modality counts;
     small : pixels below which a region may be absorbed like a point, for POINTS;
     terms : exponents of the models by degree, (p, 2) int64 each; terms[1] is a plane or the bilinear form;
-    degree : (N + 1, 2) int64, degree of range and colour of each region; a pair takes the higher of the two (step 6)
+    degree : (N + 1, 2) int64, degree of range and colour of each region; a pair takes the higher of the two (step 6);
+    settled : (N + 1,) int64, range degree that each region had earned before; at or below its degree
     """
 
     kind: int
@@ -54,6 +55,7 @@ class Rule(NamedTuple):
     small: float
     terms: tuple[NDArray[np.int64], ...]
     degree: NDArray[np.int64]
+    settled: NDArray[np.int64]
 
 
 class Work(NamedTuple):
@@ -110,7 +112,8 @@ def own_residuals(moments, k, rule, work, out):  # type: ignore[no-untyped-def]
     """Residual sums of squares of region k about its own models: out[0] range, out[1] colour.
 
     out[2]: range about a first-degree model where the own degree is higher, else inf; out[3]: mean of 1/cos^2 of
-    the slope of the surface, by which a distance along the ray exceeds the distance to the surface, squared.
+    the slope of the surface, by which a distance along the ray exceeds the distance to the surface, squared; out[4]: range about the model
+    of the settled degree.
     """
     for modality in range(2):
         first, last = channel_span(rule, modality)
@@ -129,6 +132,13 @@ def own_residuals(moments, k, rule, work, out):  # type: ignore[no-untyped-def]
         out[2] = residual(
             moments.power[k], moments.cross[k], moments.energy[k], 0, rule.n_range, rule.terms[1], work.coef
         )
+        out[4] = out[0]
+        if rule.settled[k] < rule.degree[k, 0]:
+            terms = rule.terms[rule.settled[k]]
+            solve(moments.power[k], moments.cross[k], 0, rule.n_range, terms, work.gram, work.coef)
+            out[4] = residual(
+                moments.power[k], moments.cross[k], moments.energy[k], 0, rule.n_range, terms, work.coef
+            )
 
 
 @bare
@@ -349,7 +359,7 @@ def _predicted(moments, big, small, rule, gate_r, gate_c, work):  # type: ignore
 def compare(moments, i, j, rule, own, boxes, gate_r, gate_c, work):  # type: ignore[no-untyped-def]
     """Compare two regions.
 
-    own : (N, 4) residuals of each region's own models, see own_residuals; gate_r, gate_c : shares of the boundary free of edges
+    own : (N, 5) residuals of each region's own models, see own_residuals; gate_r, gate_c : shares of the boundary free of edges
 
     Returns
     -------

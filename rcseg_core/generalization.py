@@ -22,7 +22,7 @@ PIXELS_PER_COEFFICIENT = 8
 
 
 @kernel
-def _residual_table(moments, n_range, terms, out):  # type: ignore[no-untyped-def]
+def residual_table(moments, n_range, terms, out):  # type: ignore[no-untyped-def]
     """out[k, modality, degree - 1]: residual sum of squares of region k for each degree."""
     channels = moments.energy.shape[1]
     low = moments.cross.shape[2]
@@ -76,7 +76,7 @@ def choose_degrees(
     channels = moments.energy.shape[1]
     terms = tuple(tensor_exponents(k) for k in range(5))
     table = np.zeros((moments.energy.shape[0], 2, 4))
-    _residual_table(moments, n_range, terms, table)
+    residual_table(moments, n_range, terms, table)
     degree = start.copy()
     n = moments.count
     index = np.arange(n.size)

@@ -152,7 +152,7 @@ def _drop_stale(heap, size, alive, version):  # type: ignore[no-untyped-def]
 class State(NamedTuple):
     """What grouping changes, besides the graph.
 
-    moments : sums of the regions; planes : the same centred, used alone while `flat`; own : (N, 4) see
+    moments : sums of the regions; planes : the same centred, used alone while `flat`; own : (N, 5) see
     `own_residuals`; boxes : (N, 4); rule, work : see `evidence`; shape (6,), signal (C, 5) : scratch
     """
 
@@ -251,6 +251,7 @@ def _join(keep, gone, state):  # type: ignore[no-untyped-def]
     degree = state.rule.degree
     for modality in range(2):
         degree[keep, modality] = max(degree[keep, modality], degree[gone, modality])
+    state.rule.settled[keep] = degree[keep, 0]
     own_residuals(state.moments, keep, state.rule, state.work, state.own[keep])
 
 
@@ -407,7 +408,7 @@ def group(
     flat = rule.kind in (BOUNDED, CHOW) and len(rule.terms[1]) == 3 and not (rule.degree[1:] > 1).any()
     planes = center_planes(moments) if flat else Planes(np.empty((0, 6)), np.empty((0, channels, 5)))
     state = State(
-        flat, moments, planes, np.ones((count, 4)), boxes, rule, make_work(moments), np.empty(6),
+        flat, moments, planes, np.ones((count, 5)), boxes, rule, make_work(moments), np.empty(6),
         np.empty((channels, 5)),
     )  # fmt: skip
     merges = np.empty((count, 2), np.int64)

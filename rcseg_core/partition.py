@@ -27,6 +27,8 @@ class Partition:
         self.tree = TreeBuilder(count)
         #: (count + 1,) tree node of each current region
         self.nodes = np.arange(count + 1)
+        #: (count + 1,) range degree that each region has earned in grouping
+        self.degree = np.ones(count + 1, np.int64)
 
     def apply(self, grouped: Grouped) -> NDArray[np.int64]:
         """Carry out the merges: relabel and record them. Returns the old label of each new region, (count + 1,)."""
@@ -44,6 +46,7 @@ class Partition:
     def _relabel(self, mapping: NDArray[np.int32], alive: NDArray[np.int64]) -> None:
         self.labels = mapping[self.labels]
         self.nodes = self.nodes[alive]
+        self.degree = self.degree[alive]
         self.count = alive.size - 1
 
     def add_leftovers(self, candidates: NDArray[np.bool_], least: int) -> int:
@@ -73,6 +76,7 @@ class Partition:
         inner = self.nodes > old_leaves
         self.nodes[inner] += extra
         self.nodes = np.concatenate([self.nodes, np.arange(old_leaves + 1, old_leaves + extra + 1)])
+        self.degree = np.concatenate([self.degree, np.ones(extra, np.int64)])
         self.count += extra
         return extra
 

@@ -9,7 +9,7 @@ from rcseg_core.adjacency import Pairs, find_pairs
 from rcseg_core.config import SegmenterConfig
 from rcseg_core.continuity import continuous_pairs
 from rcseg_core.evidence import KINDS, POINTS, Rule
-from rcseg_core.generalization import choose_degrees
+from rcseg_core.generalization import choose_degrees, residual_table
 from rcseg_core.grouping import add_merged, group
 from rcseg_core.models import Models, fit_models
 from rcseg_core.moments import Moments, accumulate, plane_exponents, region_boxes, tensor_exponents
@@ -29,9 +29,14 @@ def measure(
 
 
 def make_rule(
-    signals: Signals, degree: NDArray[np.int64], config: SegmenterConfig, *, planes: bool, use_color: bool = True
-) -> Rule:
-    """The comparison of a pass; `planes`: first-degree models have three terms instead of four."""
+    signals: Signals, degree: NDArray[np.int64], config: SegmenterConfig, *, planes: bool = False,
+    use_color: bool = True, settled: NDArray[np.int64] | None = None,
+) -> Rule:  # fmt: skip
+    """The comparison of a pass.
+
+    planes : first-degree models have three terms instead of four
+    settled : (N + 1,) range degree that each region has earned so far; by default the degree itself
+    """
     first = plane_exponents() if planes else tensor_exponents(1)
     terms = (tensor_exponents(0), first, tensor_exponents(2), tensor_exponents(3), tensor_exponents(4))
     return Rule(
@@ -50,6 +55,7 @@ def make_rule(
         small=config.absorption.small_region * signals.flags.size / (640 * 480),
         terms=terms,
         degree=degree,
+        settled=degree[:, 0].copy() if settled is None else np.minimum(settled, degree[:, 0]),
     )
 
 
@@ -89,13 +95,28 @@ def group_pass(
     boxes, pairs = measure(partition, edges, config)
     moments = accumulate(signals.image, signals.flags, partition.labels, partition.count, degree)
     planes = degree == 1 and config.generalization.hypothesis == "pair"
-    rule = make_rule(signals, pass_degrees(moments, signals, degree, config), config, planes=planes)
+    rule = make_rule(
+        signals, pass_degrees(moments, signals, degree, config), config, planes=planes, settled=partition.degree
+    )
     grouped = group(moments, boxes, pairs, rule, config.grouping.edge_gate)
     if planes:
         add_merged(moments, grouped.merges)
+    partition.degree = rule.settled
     alive = partition.apply(grouped)
     kept = Moments(*(a[alive] for a in moments))
     return fit_models(kept, rule.degree[alive], signals.n_range, planes)
+
+
+def curved_regions(moments: Moments, signals: Signals) -> NDArray[np.bool_]:
+    """(N + 1,) regions that a first-degree model misses by more than the tolerance."""
+    flat = np.zeros((moments.energy.shape[0], 2, 4))
+    residual_table(moments, signals.n_range, (tensor_exponents(0), tensor_exponents(1)), flat)
+    count = np.maximum(moments.count, 1.0)
+    out = np.zeros(count.size, np.bool_)
+    for k in range(1, count.size):
+        var, eps2 = local_scales(signals.law, moments.cross[k, 0, 0, 0] / count[k])
+        out[k] = flat[k, 0, 0] / count[k] > signals.n_range * var + eps2
+    return out
 
 
 def absorb_small(
@@ -109,14 +130,14 @@ def absorb_small(
         moments, signals.n_range, start, noise_variance(moments, signals), correlation(signals),
         config.generalization, highest=degree,
     )  # fmt: skip
-    rule = make_rule(signals, degrees, config, planes=False)._replace(kind=POINTS)
+    rule = make_rule(signals, degrees, config)._replace(kind=POINTS)
     alive = partition.apply(group(moments, boxes, pairs, rule, config.grouping.edge_gate))
     if signals.n_range != signals.image.shape[2]:
         return  # continuity says nothing about colour
     kept = Moments(*(a[alive] for a in moments))
     models = fit_models(kept, rule.degree[alive], signals.n_range)
     boxes, pairs = measure(partition, edges, config)
-    partition.apply(continuous_pairs(partition.labels, signals, models, pairs, rule.small))
+    partition.apply(continuous_pairs(partition.labels, signals, models, pairs, curved_regions(kept, signals), rule.small))
 
 
 def final_degrees(
@@ -158,7 +179,7 @@ def surfaces_of(
 ) -> NDArray[np.int64]:  # fmt: skip
     """(N + 1,) surface of each region of a joint partition: regions that one range model explains."""
     degree = np.full((partition.count + 1, 2), config.generalization.max_range_degree, np.int64)
-    rule = make_rule(signals, degree, config, planes=False, use_color=False)
+    rule = make_rule(signals, degree, config, use_color=False)
     grouped = group(_copy(moments), boxes.copy(), pairs, rule, config.grouping.edge_gate)
     return _groups(partition.count, grouped.merges)
 
@@ -171,6 +192,6 @@ def coarser_groups(
     count = moments.energy.shape[0] - 1
     degree = np.full((count + 1, 2), config.generalization.max_range_degree, np.int64)
     degree[:, 1] = config.generalization.max_color_degree
-    rule = make_rule(signals, degree, config, planes=False)
+    rule = make_rule(signals, degree, config)
     grouped = group(_copy(moments), boxes.copy(), pairs, rule, config.grouping.edge_gate, limit=level)
     return _groups(count, grouped.merges)
