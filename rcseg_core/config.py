@@ -216,7 +216,7 @@ class AbsorptionConfig:
         high=10000,
     )  # fmt: skip
     speck: int = _param(
-        120, "regions below this whose pixels a neighbour predicts dissolve into it", unit="px at 640x480",
+        200, "regions below this whose pixels a neighbour predicts dissolve into it", unit="px at 640x480",
         low=1, high=100000,
     )  # fmt: skip
     small_region: int = _param(

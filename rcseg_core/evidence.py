@@ -351,7 +351,9 @@ def _predicted(moments, big, small, rule, gate_r, gate_c, work):  # type: ignore
                 eps2 *= 1.0 + min(steepness / (flat * flat), MAX_TAN2)
         else:
             var, eps2 = 1.0, rule.color_eps2 * gate_c * gate_c
-        worst = max(worst, mean2 / ((last - first) * var + eps2))
+        width = last - first
+        spread = 4.0 * np.sqrt(2.0 * width * rule.correlation[modality] / n)  # 4 sigma of a mean of squares
+        worst = max(worst, mean2 / (var * (width + spread + rule.share2) + eps2))
     return np.sqrt(worst)
 
 
