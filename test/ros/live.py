@@ -244,7 +244,7 @@ class Peer:
         """Wait until the node reads these inputs and its outputs are heard here."""
         wait_until(lambda: all(self.publishers[i].get_subscription_count() for i in inputs), timeout_s)
         wait_until(lambda: self.node.count_publishers(f"{self._prefix}/labels"), timeout_s)
-        time.sleep(0.3)  # the node's side of the discovery
+        time.sleep(1.0)  # the node's side of the discovery, on a busy machine
 
     def publish(self, **messages: Any) -> None:
         for name, message in messages.items():
