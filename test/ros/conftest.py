@@ -25,7 +25,8 @@ def run(live, tmp_path):
     started = []
 
     def start(name, parameters=None, outputs=tuple(live.OUTPUTS), *, active=True, **peer_options):
-        process = live.NodeProcess(tmp_path / f"{name}.txt", parameters, {"__node": name})
+        remaps = {"__node": name, **live.input_topics(name)}
+        process = live.NodeProcess(tmp_path / f"{name}.txt", parameters, remaps)
         if active:
             process.wait_for_output("active")
         peer = live.Peer(name, outputs, **peer_options)

@@ -126,6 +126,11 @@ def stamp_of(message: Any) -> int:
     return stamp.sec * SECOND + stamp.nanosec
 
 
+def input_topics(node_name: str) -> dict[str, str]:
+    """Topics of a node's inputs: the default names for the default node, apart for every other one."""
+    return {name: name if node_name == "rcseg" else f"/{node_name}/in/{name}" for name in INPUTS}
+
+
 def assert_same(one: Any, other: Any, path: str = "message") -> None:
     """Equality of two messages field by field, NaN equal to NaN."""
     if hasattr(one, "get_fields_and_field_types"):
@@ -213,7 +218,10 @@ class Peer:
         self.arrived_s: dict[str, list[float]] = defaultdict(list)
         reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
         qos = QoSProfile(depth=10, reliability=reliability)
-        self.publishers = {name: self.node.create_publisher(kind, name, qos) for name, kind in INPUTS.items()}
+        topics = input_topics(node_name)
+        self.publishers = {
+            name: self.node.create_publisher(kind, topics[name], qos) for name, kind in INPUTS.items()
+        }
         for name in outputs:
             self._listen(name, OUTPUTS[name], f"/{node_name}/{name}")
         self._listen("diagnostics", DiagnosticArray, "/diagnostics")
@@ -244,7 +252,7 @@ class Peer:
         """Wait until the node reads these inputs and its outputs are heard here."""
         wait_until(lambda: all(self.publishers[i].get_subscription_count() for i in inputs), timeout_s)
         wait_until(lambda: self.node.count_publishers(f"{self._prefix}/labels"), timeout_s)
-        time.sleep(1.0)  # the node's side of the discovery, on a busy machine
+        time.sleep(0.5)  # the node's side of the discovery
 
     def publish(self, **messages: Any) -> None:
         for name, message in messages.items():
