@@ -68,8 +68,12 @@ def _bucket(models, k, image, flags, row, col, n_range, law, color_eps2, max_cos
 
 @bare
 def _grow(image, flags, labels, leaves, within, models, n_range, law, color_eps2, max_cost, offers):  # type: ignore[no-untyped-def]
-    """Best-first growth: unassigned pixels get an offer from each region they touch; the cheapest is taken first."""
+    """Best-first growth: unassigned pixels get an offer from each region they touch; the cheapest is taken first.
+
+    Returns the number of pixels that were absorbed.
+    """
     height, width = labels.shape
+    absorbed = 0
     used = 0
     for row in range(height):
         for col in range(width):
@@ -99,6 +103,7 @@ def _grow(image, flags, labels, leaves, within, models, n_range, law, color_eps2
         if labels[row, col] != 0:
             continue
         k = labels[offers.giver[item] // width, offers.giver[item] % width]
+        absorbed += 1
         labels[row, col] = k
         leaves[row, col] = leaves[offers.giver[item] // width, offers.giver[item] % width]
         for d in range(4):
@@ -113,10 +118,11 @@ def _grow(image, flags, labels, leaves, within, models, n_range, law, color_eps2
                 _offer(offers, used, bucket, r * width + c, offers.pixel[item])
                 used += 1
                 current = min(current, bucket)
+    return absorbed
 
 
 @bare
-def _refine(image, flags, labels, leaves, within, models, n_range, law, color_eps2, smoothness):  # type: ignore[no-untyped-def]
+def _refine(image, flags, labels, leaves, models, n_range, law, color_eps2, smoothness):  # type: ignore[no-untyped-def]
     """One raster pass: each boundary pixel takes the label with the least cost plus smoothness per other neighbour.
 
     Returns the number of pixels that changed.
@@ -148,7 +154,7 @@ def _refine(image, flags, labels, leaves, within, models, n_range, law, color_ep
                     if r < 0 or c < 0 or r >= height or c >= width:
                         continue
                 m = labels[r, c]
-                if m <= 0 or (candidate < 4 and m == k) or within[r, c] != within[row, col]:
+                if m <= 0 or (candidate < 4 and m == k):
                     continue
                 cost = pixel_cost(models, m, image, flags, row, col, n_range, law, color_eps2)
                 for i in range(-1, 2):
@@ -171,20 +177,22 @@ def _refine(image, flags, labels, leaves, within, models, n_range, law, color_ep
 def absorb(
     signals: Signals, labels: NDArray[np.int32], leaves: NDArray[np.int32], models: Models, max_cost: float,
     within: NDArray[np.int32] | None = None,
-) -> None:  # fmt: skip
+) -> int:  # fmt: skip
     """Grow regions over unassigned measured pixels, best first, in place; invalid pixels stay 0.
 
     within : (H, W) int32, optional; growth never crosses from one value of it to another
+    Returns the number of pixels that were absorbed.
     """
     unassigned = int(np.count_nonzero((labels == 0) & (signals.flags & INVALID == 0)))
     if unassigned == 0:
-        return
+        return 0
     if within is None:
         within = np.zeros_like(labels)
-    _grow(
+    absorbed: int = _grow(
         signals.image, signals.flags, labels, leaves, within, models, signals.n_range, signals.law,
         signals.color_eps2, max_cost, _make_offers(unassigned),
     )  # fmt: skip
+    return absorbed
 
 
 #: Cost of one disagreeing neighbour out of eight, in the units of `pixel_cost`.
@@ -192,16 +200,16 @@ SMOOTHNESS = 0.5
 
 
 def refine(
-    signals: Signals, labels: NDArray[np.int32], leaves: NDArray[np.int32], models: Models, passes: int,
-    within: NDArray[np.int32] | None = None,
-) -> None:  # fmt: skip
-    """Let boundary pixels move to the adjacent region that predicts them better, in place; `within` as in absorb."""
-    if within is None:
-        within = np.zeros_like(labels)
+    signals: Signals, labels: NDArray[np.int32], leaves: NDArray[np.int32], models: Models, passes: int
+) -> int:
+    """Let boundary pixels move to the adjacent region that predicts them better, in place; returns how many did."""
+    total = 0
     for _ in range(passes):
         moved = _refine(
-            signals.image, signals.flags, labels, leaves, within, models, signals.n_range, signals.law,
+            signals.image, signals.flags, labels, leaves, models, signals.n_range, signals.law,
             signals.color_eps2, SMOOTHNESS,
         )  # fmt: skip
+        total += moved
         if moved == 0:
             break
+    return total

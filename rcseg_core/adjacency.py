@@ -26,6 +26,15 @@ class Pairs(NamedTuple):
     range_crossed: NDArray[np.float64]
     color_crossed: NDArray[np.float64]
 
+    def relabelled(self, mapping: NDArray[np.int32]) -> Pairs:
+        """The pairs after regions were joined or freed (0 in `mapping`); parallel pairs add up."""
+        nodes = np.sort(mapping[self.nodes], axis=1).astype(np.int64)
+        kept = (nodes[:, 0] != nodes[:, 1]) & (nodes[:, 0] > 0)
+        size = int(mapping.max()) + 1
+        keys, inverse = np.unique(nodes[kept, 0] * size + nodes[kept, 1], return_inverse=True)
+        sums = (np.bincount(inverse, a[kept], minlength=keys.size) for a in self[1:])
+        return Pairs(np.stack([keys // size, keys % size], 1), *sums)
+
 
 @kernel
 def spread(labels, edges, rounds, cells, met):  # type: ignore[no-untyped-def]

@@ -23,7 +23,8 @@ from rcseg_core.config import NoiseConfig
 from rcseg_core.jit import kernel
 
 WINDOW_PX = 21
-STRIDE_PX = 20
+#: Windows to a side of the image that are enough for its quantiles; small images overlap them.
+WINDOWS_A_SIDE = 16
 BLOCK_PX = 5
 #: Mean square of block means over variance / BLOCK_PX^2 on white noise: the plane takes a little of it.
 WHITE_BLOCKS = 0.84
@@ -69,7 +70,7 @@ class NoiseModel:
 
 
 @kernel
-def window_residuals(values, median, valid, spread, out):  # type: ignore[no-untyped-def]
+def window_residuals(values, median, valid, spread, stride, out):  # type: ignore[no-untyped-def]
     """Residuals about a plane in windows of one channel, impulses (> 6 spread from the median) left out.
 
     values, median : (H, W) float32; valid : (H, W) bool; spread : scale of values - median; out : (n, 3) float64,
@@ -79,8 +80,8 @@ def window_residuals(values, median, valid, spread, out):  # type: ignore[no-unt
     half = WINDOW_PX // 2
     per_side = WINDOW_PX // BLOCK_PX
     index = 0
-    for row0 in range(0, height - WINDOW_PX + 1, STRIDE_PX):
-        for col0 in range(0, width - WINDOW_PX + 1, STRIDE_PX):
+    for row0 in range(0, height - WINDOW_PX + 1, stride):
+        for col0 in range(0, width - WINDOW_PX + 1, stride):
             s0 = sx = sy = sxx = sxy = syy = v0 = vx = vy = vv = 0.0
             ref = np.float64(median[row0 + half, col0 + half])
             for i in range(WINDOW_PX):
@@ -156,13 +157,14 @@ def _measure(
 ) -> _Windows:
     """Residuals of all windows of one channel."""
     height, width = values.shape
-    count = max(0, (height - WINDOW_PX) // STRIDE_PX + 1) * max(0, (width - WINDOW_PX) // STRIDE_PX + 1)
+    stride = max(8, min(height, width) // WINDOWS_A_SIDE)
+    count = max(0, (height - WINDOW_PX) // stride + 1) * max(0, (width - WINDOW_PX) // stride + 1)
     table = np.full((count, 3), np.nan)
     away = np.abs(values[::3, ::3] - median[::3, ::3])[valid[::3, ::3]]
     # 70 % of the distances are noise even when 20 % of the pixels are impulses; 1.04 sigma at 70 %
     spread = max(float(np.quantile(away, 0.7)) if away.size else 0.0, 1e-9)
     if count:
-        window_residuals(values, median, valid, spread, table)
+        window_residuals(values, median, valid, spread, stride, table)
     table = table[np.isfinite(table[:, :2]).all(axis=1)]
     quiet = table[table[:, 1] <= np.median(table[:, 1])] if len(table) else table
     quiet = quiet[np.isfinite(quiet[:, 2]) & (quiet[:, 1] > 0)]

@@ -1,6 +1,8 @@
 """The partition while it is being built: label image, leaf image and merge tree, kept in step.
 
 `labels` are the current regions 1..count; `leaves` the seeds that every pixel came with. The tree links the two.
+What is measured of the regions (moments, boxes, pairs) is kept until a pixel changes its region: grouping adds
+moments and joins pairs, so several passes need the image only once.
 """
 
 from __future__ import annotations
@@ -9,8 +11,32 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rcseg_core.absorption import absorb, refine
+from rcseg_core.adjacency import Pairs, find_pairs
 from rcseg_core.grouping import Grouped
 from rcseg_core.hierarchy import TreeBuilder
+from rcseg_core.jit import bare, kernel
+from rcseg_core.models import Models
+from rcseg_core.moments import Moments, accumulate, region_boxes
+from rcseg_core.signals import Signals
+
+
+@bare
+def relabel(labels, mapping):  # type: ignore[no-untyped-def]
+    """labels = mapping[labels], in place."""
+    for row in range(labels.shape[0]):
+        for col in range(labels.shape[1]):
+            labels[row, col] = mapping[labels[row, col]]
+
+
+@kernel
+def count_pixels(labels, count):  # type: ignore[no-untyped-def]
+    """(count + 1,) int64 number of pixels of each label."""
+    sizes = np.zeros(count + 1, np.int64)
+    for row in range(labels.shape[0]):
+        for col in range(labels.shape[1]):
+            sizes[labels[row, col]] += 1
+    return sizes
 
 
 class Partition:
@@ -29,12 +55,53 @@ class Partition:
         self.nodes = np.arange(count + 1)
         #: (count + 1,) range degree that each region has earned in grouping
         self.degree = np.ones(count + 1, np.int64)
+        self.forget()
+
+    def forget(self) -> None:
+        """Pixels have changed their regions: what was measured no longer holds."""
+        self._moments: Moments | None = None
+        self._boxes: NDArray[np.int64] | None = None
+        self._pairs: Pairs | None = None
+
+    def moments(self, signals: Signals, degree: int) -> Moments:
+        """Moments of the regions for models up to `degree` or more; grouping may add them up in place."""
+        if self._moments is None or self._moments.cross.shape[2] <= degree:
+            self._moments = accumulate(signals.image, signals.flags, self.labels, self.count, degree)
+        return self._moments
+
+    def sizes(self) -> NDArray[np.int64]:
+        """(count + 1,) pixels of each region; index 0: unassigned ones."""
+        return count_pixels(self.labels, self.count)
+
+    def boxes(self) -> NDArray[np.int64]:
+        """(count + 1, 4) boxes of the regions; grouping may join them in place."""
+        if self._boxes is None:
+            self._boxes = region_boxes(self.labels, self.count)
+        return self._boxes
+
+    def pairs(self, edges: NDArray[np.uint8], max_gap: int) -> Pairs:
+        """Adjacent regions, of one value of `within` where that is set."""
+        if self._pairs is None:
+            self._pairs = find_pairs(self.labels, self.count, edges, max_gap, self.groups())
+        return self._pairs
+
+    def absorb(self, signals: Signals, models: Models, max_cost: float) -> None:
+        """Grow the regions over unassigned pixels that they predict."""
+        if absorb(signals, self.labels, self.leaves, models, max_cost, self.within):
+            self.forget()
+
+    def refine(self, signals: Signals, models: Models, passes: int) -> None:
+        """Let boundary pixels move to the region that predicts them better."""
+        if refine(signals, self.labels, self.leaves, models, passes):
+            self.forget()
 
     def apply(self, grouped: Grouped) -> NDArray[np.int64]:
         """Carry out the merges: relabel and record them. Returns the old label of each new region, (count + 1,)."""
+        if not len(grouped.merges):
+            return np.arange(self.count + 1)
+        target = np.arange(self.count + 1)
         for (keep, gone), height in zip(grouped.merges.tolist(), grouped.heights.tolist()):
             self.nodes[keep] = self.tree.merge(int(self.nodes[keep]), int(self.nodes[gone]), height)
-        target = np.arange(self.count + 1)
         for keep, gone in grouped.merges[::-1].tolist():  # later merges first, so that every chain is followed
             target[gone] = target[keep]
         alive = np.unique(target)  # 0 stays 0
@@ -44,10 +111,17 @@ class Partition:
         return alive
 
     def _relabel(self, mapping: NDArray[np.int32], alive: NDArray[np.int64]) -> None:
-        self.labels = mapping[self.labels]
+        """New label of each old one (0: freed) and old label of each new one; what was measured goes along."""
+        relabel(self.labels, mapping)
         self.nodes = self.nodes[alive]
         self.degree = self.degree[alive]
         self.count = alive.size - 1
+        if self._moments is not None:
+            self._moments = Moments(*(a[alive] for a in self._moments))
+        if self._boxes is not None:
+            self._boxes = self._boxes[alive]
+        if self._pairs is not None:
+            self._pairs = self._pairs.relabelled(mapping)
 
     def add_leftovers(self, candidates: NDArray[np.bool_], least: int) -> int:
         """Connected unassigned pixels become regions where at least `least` hang together; returns how many did."""
@@ -78,11 +152,12 @@ class Partition:
         self.nodes = np.concatenate([self.nodes, np.arange(old_leaves + 1, old_leaves + extra + 1)])
         self.degree = np.concatenate([self.degree, np.ones(extra, np.int64)])
         self.count += extra
+        self.forget()
         return extra
 
     def drop_small(self, least: int) -> None:
         """Free the pixels of regions under `least` pixels, so that they can join a neighbour."""
-        sizes = np.bincount(self.labels.ravel(), minlength=self.count + 1)
+        sizes = self.sizes()
         keep = sizes >= least
         keep[0] = True
         if keep.all():
@@ -101,7 +176,7 @@ class Partition:
 
     def sort_by_size(self) -> NDArray[np.int64]:
         """Number the regions from the largest down (ties by number), without gaps; returns the old numbers."""
-        sizes = np.bincount(self.labels.ravel(), minlength=self.count + 1)
+        sizes = self.sizes()
         order = np.argsort(-sizes[1:], kind="stable") + 1
         order = order[sizes[order] > 0]
         mapping = np.zeros(self.count + 1, np.int32)

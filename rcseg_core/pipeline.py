@@ -8,20 +8,18 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from rcseg_core.absorption import absorb, refine
 from rcseg_core.config import SegmenterConfig
 from rcseg_core.description import describe_regions
 from rcseg_core.edges import RANGE_EDGES, detect_edges
 from rcseg_core.errors import ConfigError
 from rcseg_core.frame import RangeColorFrame
-from rcseg_core.models import Models, fit_models
-from rcseg_core.moments import Moments
+from rcseg_core.models import Models
 from rcseg_core.partition import Partition
 from rcseg_core.reflectance import normalize_reflectance
 from rcseg_core.seeds import initial_partition
 from rcseg_core.segmentation import Segmentation, compact
 from rcseg_core.signals import INVALID, Signals, build_signals
-from rcseg_core.stages import absorb_small, coarser_groups, final_degrees, group_pass, measure, surfaces_of
+from rcseg_core.stages import absorb_small, coarser_groups, final_models, group_pass, surfaces_of, top_degree
 
 
 #: Rounds of regrouping after the points are settled; two are seldom needed.
@@ -72,16 +70,18 @@ def segment(
         surfaces = partition_by(signals.range_only(), edges & RANGE_EDGES, config, None, clock, "range")
         partition = surfaces
         if config.grouping.order == "surfaces_first":
-            partition = partition_by(signals.color_only(), edges, config, surfaces.labels, clock, "color")
+            within = surfaces.labels.copy()
+            partition = partition_by(signals.color_only(), edges, config, within, clock, "color")
 
     # the two linked: both signals together decide what small regions and border pixels belong to
     if config.absorption.enabled and config.grouping.order == "surfaces_first":
         partition.within = None
+        partition.forget()
         settle(partition, signals, config)
-        absorb_small(partition, signals, edges, degrees(config, signals)[-1], config)
+        absorb_small(partition, signals, edges, config)
     partition.sort_by_size()
     moments, models = final_models(partition, signals, config)
-    boxes, pairs = measure(partition, edges, config)
+    boxes, pairs = partition.boxes(), partition.pairs(edges, config.grouping.max_gap)
     if surfaces is None:
         surface_of = surfaces_of(partition, signals, moments, boxes, pairs, config)
     else:
@@ -111,9 +111,7 @@ def segment(
 def degrees(config: SegmenterConfig, signals: Signals) -> list[int]:
     """Degrees of the grouping passes; odd ones above 1 add nothing on symmetric patches, so only the paper's
     own way (each region generalises by itself) walks through them."""
-    top = config.generalization.max_range_degree if signals.n_range else 1
-    if signals.image.shape[2] > signals.n_range:
-        top = max(top, config.generalization.max_color_degree)
+    top = top_degree(signals, config)
     ladder = (1, 2, 3, 4) if config.generalization.hypothesis == "region" else (1, 2, 4)
     return [k for k in ladder if k <= top]
 
@@ -133,24 +131,27 @@ def partition_by(
     partition = Partition(*initial_partition(signals, edges, config.seeds, within), within)
     clock.lap(f"{name} seeds")
 
-    # 3-8. group the best pair first, generalise, until nothing changes (sections 6 and 7)
-    for degree in degrees(config, signals):
-        models = group_pass(partition, signals, edges, degree, config)
-        clock.lap(f"{name} group {degree}")
-        if config.absorption.enabled:
-            absorb_points(partition, signals, models, config)
-        clock.lap(f"{name} absorb")
+    # 3-4. group planes, the best pair first; then points join the planes that predict them
+    first, *higher = degrees(config, signals)
+    models = group_pass(partition, signals, edges, first, config)
+    clock.lap(f"{name} group {first}")
     if config.absorption.enabled:
-        settle(partition, signals, config)
-        clock.lap(f"{name} settle")
-        # the points have moved the models: go on until no region changes
-        for _ in range(MAX_ROUNDS):
-            before = partition.count
-            group_pass(partition, signals, edges, degrees(config, signals)[-1], config)
-            absorb_small(partition, signals, edges, degrees(config, signals)[-1], config)
-            clock.lap(f"{name} regroup")
-            if partition.count == before:
-                break
+        absorb_points(partition, signals, models, config)
+        clock.lap(f"{name} absorb")
+
+    # 5-8. generalise and group on, until no region changes
+    for round_ in range(MAX_ROUNDS):
+        before = partition.count
+        for degree in higher:
+            models = group_pass(partition, signals, edges, degree, config)
+        clock.lap(f"{name} generalize")
+        if config.absorption.enabled:
+            if round_ == 0:
+                settle(partition, signals, config)
+            absorb_small(partition, signals, edges, config)
+            clock.lap(f"{name} absorb")
+        if partition.count == before:
+            break
     return partition
 
 
@@ -159,7 +160,7 @@ def absorb_points(partition: Partition, signals: Signals, models: Models, config
 
     Returns the number of regions that were added.
     """
-    absorb(signals, partition.labels, partition.leaves, models, config.absorption.max_cost, partition.within)
+    partition.absorb(signals, models, config.absorption.max_cost)
     measured = signals.flags & INVALID == 0
     return partition.add_leftovers(measured, scaled(config.absorption.min_region, signals.flags))
 
@@ -171,9 +172,9 @@ def settle(partition: Partition, signals: Signals, config: SegmenterConfig) -> N
     if absorb_points(partition, signals, models, config):
         models = final_models(partition, signals, config)[1]
     for limit in (1e4, 1e12):  # the order still matters; the limit no longer does
-        absorb(signals, partition.labels, partition.leaves, models, limit, partition.within)
+        partition.absorb(signals, models, limit)
     if partition.within is None:
-        refine(signals, partition.labels, partition.leaves, models, config.absorption.refine_passes)
+        partition.refine(signals, models, config.absorption.refine_passes)
     else:  # small parts of `within` that no region reached
         partition.add_leftovers(partition.within > 0, 1)
 
@@ -193,14 +194,6 @@ def number_surfaces(
     number = np.zeros(partition.count + 1, np.int64)
     number[partition.labels.ravel()] = image.ravel()
     return image, number
-
-
-def final_models(
-    partition: Partition, signals: Signals, config: SegmenterConfig
-) -> tuple[Moments, Models]:
-    """Moments of the current regions and their models at the degrees that the tests of section 7 support."""
-    moments, degree = final_degrees(partition, signals, config)
-    return moments, fit_models(moments, degree, signals.n_range)
 
 
 def scaled(pixels: int, image: NDArray[np.uint8]) -> int:

@@ -5,27 +5,16 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from rcseg_core.adjacency import Pairs, find_pairs
+from rcseg_core.adjacency import Pairs
 from rcseg_core.config import SegmenterConfig
 from rcseg_core.continuity import continuous_pairs
 from rcseg_core.evidence import KINDS, POINTS, Rule
 from rcseg_core.generalization import choose_degrees, residual_table
 from rcseg_core.grouping import add_merged, group
 from rcseg_core.models import Models, fit_models
-from rcseg_core.moments import Moments, accumulate, plane_exponents, region_boxes, tensor_exponents
+from rcseg_core.moments import Moments, plane_exponents, tensor_exponents
 from rcseg_core.partition import Partition
 from rcseg_core.signals import Signals, local_scales
-
-
-def measure(
-    partition: Partition, edges: NDArray[np.uint8], config: SegmenterConfig
-) -> tuple[NDArray[np.int64], Pairs]:
-    """Boxes and adjacent pairs of the current regions."""
-    boxes = region_boxes(partition.labels, partition.count)
-    pairs = find_pairs(
-        partition.labels, partition.count, edges, config.grouping.max_gap, partition.groups()
-    )
-    return boxes, pairs
 
 
 def make_rule(
@@ -92,19 +81,18 @@ def group_pass(
     partition: Partition, signals: Signals, edges: NDArray[np.uint8], degree: int, config: SegmenterConfig
 ) -> Models:
     """Steps 3-6 at one degree: generalise, then group until the best pair exceeds the limit. Returns the models."""
-    boxes, pairs = measure(partition, edges, config)
-    moments = accumulate(signals.image, signals.flags, partition.labels, partition.count, degree)
+    moments = partition.moments(signals, degree)
     planes = degree == 1 and config.generalization.hypothesis == "pair"
     rule = make_rule(
         signals, pass_degrees(moments, signals, degree, config), config, planes=planes, settled=partition.degree
     )
-    grouped = group(moments, boxes, pairs, rule, config.grouping.edge_gate)
+    pairs = partition.pairs(edges, config.grouping.max_gap)
+    grouped = group(moments, partition.boxes(), pairs, rule, config.grouping.edge_gate)
     if planes:
         add_merged(moments, grouped.merges)
     partition.degree = rule.settled
     alive = partition.apply(grouped)
-    kept = Moments(*(a[alive] for a in moments))
-    return fit_models(kept, rule.degree[alive], signals.n_range, planes)
+    return fit_models(partition.moments(signals, degree), rule.degree[alive], signals.n_range, planes)
 
 
 def curved_regions(moments: Moments, signals: Signals) -> NDArray[np.bool_]:
@@ -120,38 +108,53 @@ def curved_regions(moments: Moments, signals: Signals) -> NDArray[np.bool_]:
 
 
 def absorb_small(
-    partition: Partition, signals: Signals, edges: NDArray[np.uint8], degree: int, config: SegmenterConfig
+    partition: Partition, signals: Signals, edges: NDArray[np.uint8], config: SegmenterConfig
 ) -> None:
     """Step 3 for small regions: absorbed whole, like points, where a larger neighbour predicts or continues them."""
-    boxes, pairs = measure(partition, edges, config)
-    moments = accumulate(signals.image, signals.flags, partition.labels, partition.count, degree)
-    start = np.ones((partition.count + 1, 2), np.int64)
-    degrees = choose_degrees(
-        moments, signals.n_range, start, noise_variance(moments, signals), correlation(signals),
-        config.generalization, highest=degree,
-    )  # fmt: skip
-    rule = make_rule(signals, degrees, config)._replace(kind=POINTS)
-    alive = partition.apply(group(moments, boxes, pairs, rule, config.grouping.edge_gate))
+    moments, degree = final_degrees(partition, signals, config)
+    rule = make_rule(signals, degree, config)._replace(kind=POINTS)
+    pairs = partition.pairs(edges, config.grouping.max_gap)
+    alive = partition.apply(group(moments, partition.boxes(), pairs, rule, config.grouping.edge_gate))
     if signals.n_range != signals.image.shape[2]:
         return  # continuity says nothing about colour
-    kept = Moments(*(a[alive] for a in moments))
-    models = fit_models(kept, rule.degree[alive], signals.n_range)
-    boxes, pairs = measure(partition, edges, config)
-    partition.apply(continuous_pairs(partition.labels, signals, models, pairs, curved_regions(kept, signals), rule.small))
+    moments = partition.moments(signals, top_degree(signals, config))
+    models = fit_models(moments, rule.degree[alive], signals.n_range)
+    pairs = partition.pairs(edges, config.grouping.max_gap)
+    grouped = continuous_pairs(
+        partition.labels, signals, models, pairs, curved_regions(moments, signals), rule.small
+    )
+    if len(grouped.merges):
+        partition.apply(grouped)
+        partition.forget()
+
+
+def top_degree(signals: Signals, config: SegmenterConfig) -> int:
+    """Highest degree of any model of these signals."""
+    top = config.generalization.max_range_degree if signals.n_range else 1
+    if signals.image.shape[2] > signals.n_range:
+        top = max(top, config.generalization.max_color_degree)
+    return top
 
 
 def final_degrees(
     partition: Partition, signals: Signals, config: SegmenterConfig
 ) -> tuple[Moments, NDArray[np.int64]]:
     """Moments up to the highest degree and the least degrees that the tests of section 7 support."""
-    general = config.generalization
-    top = max(general.max_range_degree, general.max_color_degree)
-    moments = accumulate(signals.image, signals.flags, partition.labels, partition.count, top)
+    top = top_degree(signals, config)
+    moments = partition.moments(signals, top)
     start = np.ones((partition.count + 1, 2), np.int64)
     return moments, choose_degrees(
-        moments, signals.n_range, start, noise_variance(moments, signals), correlation(signals), general,
-        highest=top,
-    )
+        moments, signals.n_range, start, noise_variance(moments, signals), correlation(signals),
+        config.generalization, highest=top,
+    )  # fmt: skip
+
+
+def final_models(
+    partition: Partition, signals: Signals, config: SegmenterConfig
+) -> tuple[Moments, Models]:
+    """Moments of the current regions and their models at the degrees that the tests of section 7 support."""
+    moments, degree = final_degrees(partition, signals, config)
+    return moments, fit_models(moments, degree, signals.n_range)
 
 
 def _groups(grouped_count: int, merges: NDArray[np.int64]) -> NDArray[np.int64]:
