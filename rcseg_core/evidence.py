@@ -34,6 +34,7 @@ class Rule(NamedTuple):
     share2 : squared noise share; relief2 : squared relief tolerance;
     correlation : pixels an independent measurement, of range and of colour;
     slope : gradient (whitened, per UNIT_PX) of a surface tilted by 45 degrees, as a + b s of the signal; beta2 : beta^2 of eq. (20); use_range, use_color : whether a modality counts;
+    earn : whether a side must earn the tolerance and a new degree (not at levels that users ask for);
     small : pixels below which a region may be absorbed like a point, for POINTS;
     terms : exponents of the models by degree, (p, 2) int64 each; terms[1] is a plane or the bilinear form;
     degree : (N + 1, 2) int64, degree of range and colour of each region; a pair takes the higher of the two (step 6);
@@ -52,6 +53,7 @@ class Rule(NamedTuple):
     beta2: float
     use_range: bool
     use_color: bool
+    earn: bool
     small: float
     terms: tuple[NDArray[np.int64], ...]
     degree: NDArray[np.int64]

@@ -29,6 +29,13 @@ def relabel(labels, mapping):  # type: ignore[no-untyped-def]
             labels[row, col] = mapping[labels[row, col]]
 
 
+@bare
+def _follow(merges, target):  # type: ignore[no-untyped-def]
+    """target[k]: the region that k ended in; later merges first, so that every chain is followed."""
+    for t in range(merges.shape[0] - 1, -1, -1):
+        target[merges[t, 1]] = target[merges[t, 0]]
+
+
 @kernel
 def count_pixels(labels, count):  # type: ignore[no-untyped-def]
     """(count + 1,) int64 number of pixels of each label."""
@@ -99,11 +106,9 @@ class Partition:
         """Carry out the merges: relabel and record them. Returns the old label of each new region, (count + 1,)."""
         if not len(grouped.merges):
             return np.arange(self.count + 1)
+        self.tree.merge(grouped.merges, grouped.heights, self.nodes)
         target = np.arange(self.count + 1)
-        for (keep, gone), height in zip(grouped.merges.tolist(), grouped.heights.tolist()):
-            self.nodes[keep] = self.tree.merge(int(self.nodes[keep]), int(self.nodes[gone]), height)
-        for keep, gone in grouped.merges[::-1].tolist():  # later merges first, so that every chain is followed
-            target[gone] = target[keep]
+        _follow(grouped.merges, target)
         alive = np.unique(target)  # 0 stays 0
         new = np.zeros(self.count + 1, np.int32)
         new[alive] = np.arange(alive.size)

@@ -19,7 +19,7 @@ from rcseg_core.reflectance import normalize_reflectance
 from rcseg_core.seeds import initial_partition
 from rcseg_core.segmentation import Segmentation, compact
 from rcseg_core.signals import INVALID, Signals, build_signals
-from rcseg_core.stages import absorb_small, coarser_groups, final_models, group_pass, surfaces_of, top_degree
+from rcseg_core.stages import absorb_small, coarser_merges, final_models, group_pass, surfaces_of, top_degree
 
 
 #: Rounds of regrouping after the points are settled; two are seldom needed.
@@ -96,15 +96,17 @@ def segment(
         labels=partition.labels,
         surface_labels=surface_labels,
         regions=regions,
-        hierarchy=partition.tree.build(),
+        tree=partition.tree.build(),
+        range_tree=surfaces.tree.build() if surfaces is not None else None,
         edges=edges,
         timings=clock.seconds,
         camera=frame.camera,
         signals=signals,
         models=models,
         leaves=partition.leaves,
+        range_leaves=surfaces.leaves if surfaces is not None else None,
         nodes=partition.nodes,
-        coarsen=partial(coarser_groups, signals, moments, boxes, pairs, config),
+        coarsen=partial(coarser_merges, signals, moments, boxes, pairs, config),
     )
 
 

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from rcseg_core.bezier import BezierPatch
 from rcseg_core.frame import PinholeCamera
-from rcseg_core.hierarchy import Hierarchy
+from rcseg_core.grouping import Grouped
+from rcseg_core.hierarchy import Hierarchy, TreeBuilder
 from rcseg_core.models import Models, render
 from rcseg_core.signals import Signals
 
@@ -53,7 +54,6 @@ class Segmentation:
     labels : (H, W) int32; 0 unlabelled, 1..N regions of one surface and one colour model, largest first
     surface_labels : (H, W) int32; 0 unlabelled, 1..M continuous surfaces, unions of regions
     regions : sequence of Region, ``regions[i].label == i + 1``
-    hierarchy : merge tree over the initial partition
     edges : (H, W) uint8 bit mask: depth 1, orientation 2, colour 4
     noise : the NoiseModel that was used
     timings : seconds by stage, in order
@@ -63,20 +63,34 @@ class Segmentation:
     labels: NDArray[np.int32]
     surface_labels: NDArray[np.int32]
     regions: Sequence[Region]
-    hierarchy: Hierarchy
     edges: NDArray[np.uint8]
     timings: dict[str, float]
     camera: PinholeCamera | None
     signals: Signals = field(repr=False)
     models: Models = field(repr=False)
+    tree: Hierarchy = field(repr=False)
+    range_tree: Hierarchy | None = field(repr=False)
     leaves: NDArray[np.int32] = field(repr=False)
+    range_leaves: NDArray[np.int32] | None = field(repr=False)
     nodes: NDArray[np.int64] = field(repr=False)
-    coarsen: Callable[[float], NDArray[np.int64]] = field(repr=False)
+    coarsen: Callable[[], Grouped] = field(repr=False)
 
     @property
     def noise(self):  # type: ignore[no-untyped-def]
         """The NoiseModel of this frame."""
         return self.signals.noise
+
+    @cached_property
+    def hierarchy(self) -> Hierarchy:
+        """The merge tree: seeds to regions (heights up to 1), regions to what a wider limit would join (above 1).
+
+        `nodes` (N + 1,) holds the node of each region.
+        """
+        builder = TreeBuilder.resume(self.tree)
+        grouped = self.coarsen()
+        above = np.maximum(grouped.heights, np.nextafter(1.0, 2.0))
+        builder.merge(grouped.merges, above, self.nodes.copy())
+        return builder.build()
 
     def labels_at(self, level: float) -> NDArray[np.int32]:
         """The partition at another approximation limit, without segmenting again.
@@ -101,9 +115,11 @@ class Segmentation:
         if level == 1:
             return self.labels.copy()
         if level > 1:
-            groups = self.coarsen(float(level))[self.labels]
-        else:
-            groups = self.hierarchy.cut(level)[self.leaves]
+            groups = self.hierarchy.cut(level)[self.nodes][self.labels]
+        else:  # within each region: what the colours, and the ranges, join at this level
+            groups = _paired(self.labels, self.tree.cut(level)[self.leaves])
+            if self.range_tree is not None and self.range_leaves is not None:
+                groups = _paired(groups, self.range_tree.cut(level)[self.range_leaves])
         groups[self.labels == 0] = 0
         return compact(groups)
 
@@ -133,6 +149,12 @@ class Segmentation:
             points = self.camera.rays(*self.labels.shape) / inverse[..., None]
         points[unlabelled] = np.nan
         return points.astype(np.float32), color
+
+
+def _paired(first: NDArray[np.integer], second: NDArray[np.integer]) -> NDArray[np.int64]:
+    """One positive number for each pair of values that occurs."""
+    keys = first.astype(np.int64) * (int(second.max()) + 1) + second
+    return np.unique(keys, return_inverse=True)[1].reshape(first.shape) + 1
 
 
 def compact(groups: NDArray[np.integer]) -> NDArray[np.int32]:

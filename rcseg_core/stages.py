@@ -10,7 +10,7 @@ from rcseg_core.config import SegmenterConfig
 from rcseg_core.continuity import continuous_pairs
 from rcseg_core.evidence import KINDS, POINTS, Rule
 from rcseg_core.generalization import choose_degrees, residual_table
-from rcseg_core.grouping import add_merged, group
+from rcseg_core.grouping import Grouped, add_merged, group
 from rcseg_core.models import Models, fit_models
 from rcseg_core.moments import Moments, plane_exponents, tensor_exponents
 from rcseg_core.partition import Partition
@@ -41,6 +41,7 @@ def make_rule(
         beta2=config.grouping.prior_beta**2,
         use_range=signals.n_range > 0,
         use_color=use_color and signals.image.shape[2] > signals.n_range,
+        earn=True,
         small=config.absorption.small_region * signals.flags.size / (640 * 480),
         terms=terms,
         degree=degree,
@@ -187,14 +188,16 @@ def surfaces_of(
     return _groups(partition.count, grouped.merges)
 
 
-def coarser_groups(
-    signals: Signals, moments: Moments, boxes: NDArray[np.int64], pairs: Pairs, config: SegmenterConfig,
-    level: float,
-) -> NDArray[np.int64]:  # fmt: skip
-    """(N + 1,) group of each region when the approximation limit is `level` times as wide."""
+#: A limit that any pair with a joint model keeps.
+NO_LIMIT = 1e9
+
+
+def coarser_merges(
+    signals: Signals, moments: Moments, boxes: NDArray[np.int64], pairs: Pairs, config: SegmenterConfig
+) -> Grouped:
+    """The groupings that would follow if the approximation limit were widened on and on, and what each needs."""
     count = moments.energy.shape[0] - 1
     degree = np.full((count + 1, 2), config.generalization.max_range_degree, np.int64)
     degree[:, 1] = config.generalization.max_color_degree
-    rule = make_rule(signals, degree, config)
-    grouped = group(_copy(moments), boxes.copy(), pairs, rule, config.grouping.edge_gate, limit=level)
-    return _groups(count, grouped.merges)
+    rule = make_rule(signals, degree, config)._replace(earn=False)
+    return group(_copy(moments), boxes.copy(), pairs, rule, config.grouping.edge_gate, limit=NO_LIMIT)
