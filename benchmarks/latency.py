@@ -37,7 +37,7 @@ def main() -> None:
     options.add_argument("--outputs", default="labels", help="outputs that are listened to, with commas")
     given = options.parse_args()
     if given.default_transport:
-        live.ISOLATED["FASTRTPS_DEFAULT_PROFILES_FILE"] = ""
+        del live.ISOLATED["FASTRTPS_DEFAULT_PROFILES_FILE"]
     with tempfile.TemporaryDirectory() as folder:
         node = live.NodeProcess(Path(folder) / "log.txt")
         node.wait_for_output("active")

@@ -21,7 +21,6 @@ from rcseg_ros.outputs import Make
 from rcseg_ros.region_statistics import region_statistics
 
 PATCH_KINDS = {"inverse_depth": 1, "xyz": 2, "rgb": 3}  # the constants of BezierPatch.msg
-LEVELS = (1.25, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0)  # at which MergeTree.msg tells what has merged
 
 
 def region_array(frame: RangeColorFrame, result: Segmentation, header: Any, make: Make) -> Any:
@@ -130,20 +129,17 @@ def _flat(values: Any) -> np.ndarray[Any, np.dtype[np.float64]]:
 
 
 def _merge_tree(result: Segmentation, make: Make) -> Any:
-    """Forest over the regions: at each level a new node for every group that unites several nodes."""
-    count = len(result.regions)
-    node = np.arange(count + 1)  # where each label stands at the present level
+    """The part of the merge tree above the regions; below them lie seeds, which messages do not show."""
+    tree, count = result.hierarchy, len(result.regions)
+    number = {int(node): label for label, node in enumerate(result.nodes) if label}
     parent, height = [0] * count, [1.0] * count
-    for level in LEVELS:
-        groups = result.coarsen(level)
-        for group in np.unique(groups[1:]):
-            members = np.unique(node[1:][groups[1:] == group])
-            if len(members) > 1:
-                parent.append(0)
-                height.append(level)
-                for member in members:
-                    parent[member - 1] = len(parent)
-                node[np.isin(node, members)] = len(parent)
+    for merge in np.flatnonzero(tree.heights > 1).tolist():
+        below = [number[int(child)] for child in tree.children[merge]]
+        parent.append(0)
+        height.append(float(tree.heights[merge]))
+        number[tree.leaf_count + 1 + merge] = len(parent)
+        for node in below:
+            parent[node - 1] = len(parent)
     return make(
         "rcseg_msgs/msg/MergeTree", parent=np.array(parent, np.uint32), height=np.array(height, np.float64)
     )

@@ -8,7 +8,6 @@ counted by its reason, shown in /diagnostics and warned of once a throttle perio
 
 from __future__ import annotations
 
-import signal
 import sys
 import threading
 import time
@@ -29,6 +28,7 @@ from rcseg_ros.conversions import Header, header_of
 from rcseg_ros.extrinsic import TransformListener, rigid
 from rcseg_ros.health import Health
 from rcseg_ros.inputs import Inputs
+from rcseg_ros.manners import Interrupt, answer_impossible_transitions, told
 from rcseg_ros.messages import make_rcl
 from rcseg_ros.parameters import NodeParameters
 from rcseg_ros.publishers import ResultPublishers
@@ -36,7 +36,7 @@ from rcseg_ros.sync import Pair
 from rcseg_ros.warmup import warm_up
 from rcseg_ros.worker import Worker
 
-SUCCESS, ERROR = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.ERROR
+SUCCESS = TransitionCallbackReturn.SUCCESS
 STOP_TIMEOUT_S = 1.0
 
 
@@ -60,7 +60,7 @@ class SegmentationNode(LifecycleNode):
         self._publishing = threading.Lock()  # held while the worker publishes and while publishers go
         self._active = False
         self._configured: list[Any] = []  # what on_configure made, undone in reverse order
-        self._guard_change_state()
+        answer_impossible_transitions(self)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         # Diagnostics go on while simulated time stands still.
         self.create_timer(1.0, self._report, clock=Clock(clock_type=ClockType.STEADY_TIME))
@@ -79,7 +79,7 @@ class SegmentationNode(LifecycleNode):
         self._active = False
         self._tear_down()
 
-    # Lifecycle: rclpy swallows exceptions of these callbacks, so each says itself what went wrong.
+    # Lifecycle.
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         try:
@@ -90,22 +90,26 @@ class SegmentationNode(LifecycleNode):
             return TransitionCallbackReturn.FAILURE
         return super().on_configure(state)
 
+    @told
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         self._inputs.start()
         self._active = True
         self.get_logger().info(f"active: waiting for {', '.join(self._inputs.topics)}")
         return super().on_activate(state)
 
+    @told
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         self._active = False
         self._inputs.stop()
         self._worker.clear()
         return super().on_deactivate(state)
 
+    @told
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         self._tear_down()
         return SUCCESS
 
+    @told
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         self.close()
         return SUCCESS
@@ -208,53 +212,10 @@ class SegmentationNode(LifecycleNode):
         known = isinstance(error, RcsegError)
         self.get_logger().error(f"cannot {what}: {error if known else repr(error)}")
 
-    def _guard_change_state(self) -> None:
-        """Answer an impossible transition with failure: rclpy would let it raise and end the node."""
-        service = self._service_change_state
-        change_state = service.callback
-
-        def guarded(request: Any, response: Any) -> Any:
-            try:
-                return change_state(request, response)
-            except Exception as error:
-                self.get_logger().warning(f"transition refused in state {self._state()}: {error}")
-                response.success = False
-                return response
-
-        service.callback = guarded
-
-
-class _Interrupt:
-    """SIGINT as KeyboardInterrupt, but for the first while the node spins, which rclpy itself ends then.
-
-    An exception in the middle of a message's conversion would come out as a fault of that message.
-    """
-
-    def __init__(self) -> None:
-        self.spinning = False
-        signal.signal(signal.SIGINT, self._on_signal)  # before rclpy.init, which passes signals on
-
-    def _on_signal(self, number: int, stack: Any) -> None:
-        if not self.spinning:
-            signal.default_int_handler(number, stack)
-        self.spinning = False
-
-
-def _spin(executor: SingleThreadedExecutor, node: SegmentationNode) -> None:
-    """Spin until the context is shut down; what the executor raises for a message is a rejection."""
-    while rclpy.ok():
-        try:
-            executor.spin_once()
-        except ExternalShutdownException:
-            return
-        except Exception as error:
-            if rclpy.ok():
-                node.reject(error, "message")
-
 
 def main(args: list[str] | None = None) -> int:
     """Run the node until it is told to stop; exit code 0, or 2 where a parameter cannot be used."""
-    interrupt = _Interrupt()
+    interrupt = Interrupt()
     rclpy.init(args=args)
     node = None
     try:
@@ -262,8 +223,7 @@ def main(args: list[str] | None = None) -> int:
         executor = SingleThreadedExecutor()
         executor.add_node(node)
         node.autostart()
-        interrupt.spinning = True
-        _spin(executor, node)
+        interrupt.spin(executor, lambda error: node.reject(error, "message"))
     except ConfigError as error:
         print(f"segmentation_node: {error}", file=sys.stderr)
         return 2

@@ -84,6 +84,31 @@ def test_shutdown_transition_ends_the_work_not_the_process(idle):
     assert process.process.poll() is None
 
 
+def test_an_error_in_a_transition_is_told_and_recovered_from(live, monkeypatch, capfd):
+    import rclpy
+    from rclpy.context import Context
+
+    from rcseg_ros.inputs import Inputs
+    from rcseg_ros.node import SegmentationNode
+
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(live.DOMAIN))
+    context = Context()
+    rclpy.init(context=context)
+    node = SegmentationNode(context=context)
+    monkeypatch.setattr(Inputs, "start", lambda self: 1 / 0)
+    node.trigger_configure()
+    node.trigger_activate()
+    assert node._state_machine.current_state[1] == "unconfigured"
+    assert "on_activate failed: ZeroDivisionError" in capfd.readouterr().err
+    monkeypatch.undo()
+    node.trigger_configure()
+    node.trigger_activate()
+    assert node._state_machine.current_state[1] == "active"
+    node.close()
+    node.destroy_node()
+    context.try_shutdown()
+
+
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
 def test_signals_in_mid_frame(live, run, how):
     process, peer = run("doomed", {}, ("labels",))

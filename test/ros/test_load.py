@@ -50,6 +50,15 @@ def test_services_answer_while_frames_are_in_work(live, run):
     assert np.percentile(answers_ms, 95) < 100, f"services took {np.percentile(answers_ms, [50, 95, 100])} ms"
 
 
+def test_a_camera_stream_is_not_lost_in_transport(live, run):
+    """30 Hz of 640x480 cloud and image, 7 MB a frame: the node may drop frames, the transport none."""
+    _, peer = run("streamed", {}, ("labels",))
+    peer.connected("points", "image", "camera_info")
+    sent = _flood(live, peer, live.scene(height=480, width=640), 3.0, 30.0)
+    live.wait_until(lambda: peer.count("received.image") >= sent, 5, peer.diagnostics)
+    assert peer.count("received.points") == peer.count("received.image") == sent > 60
+
+
 def test_outputs_without_listeners_are_not_computed(live, monkeypatch):
     from rcseg_core import SegmenterConfig, segment
     from rcseg_ros import publishers

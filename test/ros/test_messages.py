@@ -105,8 +105,8 @@ def test_the_merge_tree_cuts_as_the_core_does(case):
     _, result, message = case
     parent, height = message.hierarchy.parent, message.hierarchy.height
     count = len(message.regions)
-    assert np.all(height[:count] == 1) and np.all(np.diff(height[count:]) >= 0)
-    assert all(p == 0 or p > n for n, p in enumerate(parent, start=1))
+    assert np.all(height[:count] == 1) and np.all(height[count:] > 1)
+    assert all(p == 0 or (p > n and height[p - 1] >= height[n - 1]) for n, p in enumerate(parent, start=1))
     for level in (1.0, 2.0, 16.0):
         tops = []
         for node in range(1, count + 1):
