@@ -8,6 +8,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from rcseg_core.adjacency import spread
 from rcseg_core.config import SegmenterConfig
 from rcseg_core.description import describe_regions
 from rcseg_core.edges import RANGE_EDGES, detect_edges
@@ -24,6 +25,8 @@ from rcseg_core.stages import absorb_small, coarser_merges, final_models, group_
 
 #: Rounds of regrouping after the points are settled; two are seldom needed.
 MAX_ROUNDS = 3
+#: Holes up to twice this wide are bridged when surfaces bound the windows of colour.
+HOLE_PX = 4
 
 
 def segment(
@@ -70,7 +73,7 @@ def segment(
         surfaces = partition_by(signals.range_only(), edges & RANGE_EDGES, config, None, clock, "range")
         partition = surfaces
         if config.grouping.order == "surfaces_first":
-            within = surfaces.labels.copy()
+            within = bridge_holes(surfaces.labels)
             partition = partition_by(signals.color_only(), edges, config, within, clock, "color")
 
     # the two linked: both signals together decide what small regions and border pixels belong to
@@ -157,6 +160,13 @@ def partition_by(
     return partition
 
 
+def bridge_holes(labels: NDArray[np.int32]) -> NDArray[np.int32]:
+    """`labels` spread over holes of a few pixels, so that missing pixels do not fence in the windows of colour."""
+    bridged, met = np.empty_like(labels), np.empty(labels.shape, np.uint8)
+    spread(labels, np.zeros(labels.shape, np.uint8), HOLE_PX, bridged, met)
+    return bridged
+
+
 def absorb_points(partition: Partition, signals: Signals, models: Models, config: SegmenterConfig) -> int:
     """Step 3: points join the regions that predict them; what hangs together and fits nowhere is a region.
 
@@ -178,7 +188,7 @@ def settle(partition: Partition, signals: Signals, config: SegmenterConfig) -> N
     if partition.within is None:
         partition.refine(signals, models, config.absorption.refine_passes)
     else:  # small parts of `within` that no region reached
-        partition.add_leftovers(partition.within > 0, 1)
+        partition.add_leftovers((partition.within > 0) & (signals.flags & INVALID == 0), 1)
 
 
 def majority(partition: Partition, surfaces: Partition) -> NDArray[np.int64]:
