@@ -94,3 +94,36 @@ def group(count, adjacent, ratio):
         members[keep] |= members.pop(gone)
         moved = {tuple(sorted(keep if k == gone else k for k in pair)) for pair in links}
         links = {pair for pair in moved if pair[0] != pair[1]}
+
+
+class PlaneRatio:
+    """`ratio` for `group`: planes fitted to the pixels of two sets of seeds, tolerances gated by edges.
+
+    label (n,) seed of each pixel; share2, eps2 : allowed square errors of a pixel by noise and by modality;
+    tallies : {(a, b): [boundary, range edges, colour edges]} of seeds, or None for no gate.
+    """
+
+    def __init__(self, x, y, values, label, n_range, share2, eps2, tallies=None, whole=False):
+        self.pixels, self.label, self.n_range = (x, y, values), label, n_range
+        self.share2, self.eps2, self.tallies, self.whole = share2, eps2, tallies, whole
+
+    def size(self, members):
+        return int(np.isin(self.label, list(members)).sum())
+
+    def gates(self, one, other):
+        if self.tallies is None:
+            return 1.0, 1.0
+        total = np.zeros(3)
+        for (a, b), tally in self.tallies.items():
+            if (a in one and b in other) or (b in one and a in other):
+                total += tally
+        return 1 - total[1] / total[0], 1 - total[2] / total[0]
+
+    def __call__(self, one, other):
+        channels = (self.n_range, self.pixels[2].shape[1] - self.n_range)
+        p = [3 * width for width in channels]
+        allowances = [k + 4 * (2 * k) ** 0.5 for k in p]
+        gates = self.gates(one, other)
+        budgets = [self.share2 + eps2 * gate**2 for eps2, gate in zip(self.eps2, gates, strict=True)]
+        a, b = (np.isin(self.label, list(m)) for m in (one, other))
+        return plane_ratio(*self.pixels, a, b, self.n_range, allowances, budgets, self.whole)
