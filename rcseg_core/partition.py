@@ -60,8 +60,6 @@ class Partition:
         self.tree = TreeBuilder(count)
         #: (count + 1,) tree node of each current region
         self.nodes = np.arange(count + 1)
-        #: (count + 1,) range degree that each region has earned in grouping
-        self.degree = np.ones(count + 1, np.int64)
         self.forget()
 
     def forget(self) -> None:
@@ -119,7 +117,6 @@ class Partition:
         """New label of each old one (0: freed) and old label of each new one; what was measured goes along."""
         relabel(self.labels, mapping)
         self.nodes = self.nodes[alive]
-        self.degree = self.degree[alive]
         self.count = alive.size - 1
         if self._moments is not None:
             self._moments = Moments(*(a[alive] for a in self._moments))
@@ -155,7 +152,6 @@ class Partition:
         inner = self.nodes > old_leaves
         self.nodes[inner] += extra
         self.nodes = np.concatenate([self.nodes, np.arange(old_leaves + 1, old_leaves + extra + 1)])
-        self.degree = np.concatenate([self.degree, np.ones(extra, np.int64)])
         self.count += extra
         self.forget()
         return extra

@@ -64,34 +64,37 @@ def correlation(signals: Signals) -> tuple[float, float]:
     return signals.noise.range_correlation, signals.noise.color_correlation
 
 
-def pass_degrees(
-    moments: Moments, signals: Signals, degree: int, config: SegmenterConfig
-) -> NDArray[np.int64]:
-    """Degrees with which the regions enter a pass: all at `degree` (pair), or each as its own tests say (region)."""
-    general = config.generalization
+def tested_degrees(moments: Moments, signals: Signals, highest: int, config: SegmenterConfig) -> NDArray[np.int64]:
+    """(N + 1, 2) the degrees of range and colour that the tests of section 7 support, up to `highest`."""
     start = np.ones((moments.energy.shape[0], 2), np.int64)
-    if general.hypothesis == "pair":
-        start[:, 0] = min(degree, general.max_range_degree)
-        start[:, 1] = min(degree, general.max_color_degree)
-        return start
-    variance = noise_variance(moments, signals)
-    return choose_degrees(moments, signals.n_range, start, variance, correlation(signals), general, highest=degree)
+    return choose_degrees(
+        moments, signals.n_range, start, noise_variance(moments, signals), correlation(signals),
+        config.generalization, highest=highest,
+    )  # fmt: skip
 
 
 def group_pass(
     partition: Partition, signals: Signals, edges: NDArray[np.uint8], degree: int, config: SegmenterConfig
 ) -> Models:
-    """Steps 3-6 at one degree: generalise, then group until the best pair exceeds the limit. Returns the models."""
+    """Steps 3-6 at one degree: generalise, then group until the best pair exceeds the limit. Returns the models.
+
+    With hypothesis "pair" every pair is tried at the degree of the pass, and must earn it where neither side has;
+    with "region" (the paper) each region has the degree that its own tests support.
+    """
+    general = config.generalization
     moments = partition.moments(signals, degree)
-    planes = degree == 1 and config.generalization.hypothesis == "pair"
-    rule = make_rule(
-        signals, pass_degrees(moments, signals, degree, config), config, planes=planes, settled=partition.degree
-    )
+    tested = tested_degrees(moments, signals, degree, config)
+    pair = general.hypothesis == "pair"
+    tried = tested
+    if pair:
+        tried = np.minimum([[degree, degree]], [[general.max_range_degree, general.max_color_degree]])
+        tried = np.repeat(tried, partition.count + 1, axis=0)
+    planes = degree == 1 and pair
+    rule = make_rule(signals, tried, config, planes=planes, settled=tested[:, 0])
     pairs = partition.pairs(edges, config.grouping.max_gap)
     grouped = group(moments, partition.boxes(), pairs, rule, config.grouping.edge_gate)
     if planes:
         add_merged(moments, grouped.merges)
-    partition.degree = rule.settled
     alive = partition.apply(grouped)
     return fit_models(partition.moments(signals, degree), rule.degree[alive], signals.n_range, planes)
 
@@ -143,11 +146,7 @@ def final_degrees(
     """Moments up to the highest degree and the least degrees that the tests of section 7 support."""
     top = top_degree(signals, config)
     moments = partition.moments(signals, top)
-    start = np.ones((partition.count + 1, 2), np.int64)
-    return moments, choose_degrees(
-        moments, signals.n_range, start, noise_variance(moments, signals), correlation(signals),
-        config.generalization, highest=top,
-    )  # fmt: skip
+    return moments, tested_degrees(moments, signals, top, config)
 
 
 def final_models(
