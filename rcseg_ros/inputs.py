@@ -1,8 +1,8 @@
 """The node's input topics and their pairing policy: which range topic counts, whose colour, which camera.
 
-Runs on the executor's thread and only pairs; decoding is the worker's. What `auto` means is decided here,
-from what arrives and from which topics have publishers, so that a node works with most drivers before any
-parameter is set.
+Runs on the executor's thread and only pairs; decoding images and clouds is the worker's. What `auto` means
+is decided here, from what arrives and from which topics have publishers, so that a node works with most
+drivers before any parameter is set.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
-from rcseg_ros.conversions import header_of
+from rcseg_ros.conversions import decode_camera_info, header_of
 from rcseg_ros.health import Health
 from rcseg_ros.parameters import NodeParameters
 from rcseg_ros.subscriptions import AdaptiveSubscription
@@ -105,7 +105,10 @@ class Inputs:
     def _pair(self, topic: str, stamp_ns: int, message: Any) -> list[Pair]:
         color_from, camera = self._parameters["input.color_from"], self._parameters["input.camera"]
         if topic == "camera_info":
-            return [] if camera == "none" else self._sync.add_camera(stamp_ns, message)
+            if camera == "none":
+                return []
+            decode_camera_info(message)  # one that cannot be used must not take the place of one that can
+            return self._sync.add_camera(stamp_ns, message)
         if topic == "image":
             return [] if color_from == "cloud" else self._sync.add_color(stamp_ns, message)
         if self._source == "auto":

@@ -53,8 +53,8 @@ def answer_impossible_transitions(node: LifecycleNode) -> None:
 class Interrupt:
     """SIGINT as KeyboardInterrupt, but for the first while the node spins, which rclpy itself ends then.
 
-    An exception in the middle of a message's conversion would come out as a fault of that message. Made before
-    `rclpy.init`, which passes signals on.
+    An exception in the middle of a message's conversion would come out as a fault of that message. Make it
+    before `rclpy.init`, which passes signals on.
     """
 
     def __init__(self) -> None:
@@ -62,7 +62,7 @@ class Interrupt:
         signal.signal(signal.SIGINT, self._on_signal)
 
     def spin(self, executor: SingleThreadedExecutor, on_error: Callable[[Exception], None]) -> None:
-        """Spin until the context is shut down; what the executor raises is told, and the spinning goes on."""
+        """Spin until the context is shut down; what the executor raises is told, and spinning goes on."""
         self._spinning = True
         while rclpy.ok():
             try:
