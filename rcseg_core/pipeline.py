@@ -19,7 +19,7 @@ from rcseg_core.partition import Partition
 from rcseg_core.reflectance import normalize_reflectance
 from rcseg_core.seeds import initial_partition
 from rcseg_core.segmentation import Segmentation, compact
-from rcseg_core.signals import INVALID, Signals, build_signals
+from rcseg_core.signals import INVALID, MISFIT, Signals, build_signals
 from rcseg_core.stages import absorb_small, coarser_merges, final_models, group_pass, surfaces_of, top_degree
 
 
@@ -183,8 +183,10 @@ def settle(partition: Partition, signals: Signals, config: SegmenterConfig) -> N
     models = final_models(partition, signals, config)[1]
     if absorb_points(partition, signals, models, config):
         models = final_models(partition, signals, config)[1]
+    unpredicted = partition.labels == 0
     for limit in (1e4, 1e12):  # the order still matters; the limit no longer does
         partition.absorb(signals, models, limit)
+    signals.flags[unpredicted & (partition.labels > 0)] |= MISFIT
     if partition.within is None:
         partition.refine(signals, models, config.absorption.refine_passes)
     else:  # small parts of `within` that no region reached

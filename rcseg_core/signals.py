@@ -22,6 +22,8 @@ from rcseg_core.noise import NoiseModel, estimate_noise
 
 # Flags of a pixel, a bit mask in `Signals.flags`.
 INVALID, RANGE_OUTLIER, COLOR_OUTLIER = 1, 2, 4
+#: Has the label of a neighbour although no model predicts it: counts for no fit.
+MISFIT = 8
 
 
 @dataclass(frozen=True)
@@ -32,7 +34,7 @@ class Signals:
     ----------
     image : (H, W, C) float32, C = Cr + 3; channel c is (signal - offset[c]) / scale[c]; 0 where invalid
     cleaned : (H, W, C) float32, image with invalid pixels and impulses replaced by the local median
-    flags : (H, W) uint8 bit mask: 1 invalid, 2 range impulse, 4 colour impulse
+    flags : (H, W) uint8 bit mask: 1 invalid, 2 range impulse, 4 colour impulse, 8 misfit (set while segmenting)
     n_range : Cr, 1 for inverse depth, 3 for x, y, z
     scale, offset : (C,) float64
     law : (6,) float64, `local_scales` reads it: variance of the whitened range noise and squared tolerances
