@@ -1,0 +1,202 @@
+"""The measured noise is the noise that was put in, whatever else the frame holds (Sigma of eq. 3)."""
+
+import cv2
+import numpy as np
+import pytest
+
+from rcseg_core import PinholeCamera, RangeColorFrame, SegmenterConfig
+from rcseg_core.cleaning import color_median, local_median
+from rcseg_core.config import NoiseConfig
+from rcseg_core.noise import (
+    BLOCK_PX,
+    COLOR_FLOOR_LEVELS,
+    RELATIVE_FLOOR,
+    SENSOR_MODELS,
+    WINDOW_PX,
+    estimate_noise,
+    window_residuals,
+)
+from rcseg_core.signals import build_signals
+
+SHAPE = (240, 320)
+CAMERA = PinholeCamera(260.0, 260.0, 159.5, 119.5)
+SIGMA = 2e-3  # 1/m
+
+
+def room(shape=SHAPE):
+    """Inverse depth of a floor, a wall and a box in front: steps and creases, 0.25 to 0.6 per metre."""
+    rows, cols = np.mgrid[: shape[0], : shape[1]]
+    w = np.maximum(0.3 + 2e-4 * cols, 0.25 + 1.5e-3 * (rows - 120))
+    w[60:150, 100:190] = 0.55 + 3e-4 * (cols[60:150, 100:190] - 100)
+    return w
+
+
+def estimated(w, valid=None, color=None, **changes):
+    w = w.astype(np.float32)[..., None]
+    valid = np.ones(w.shape[:2], bool) if valid is None else valid
+    w[~valid] = 0
+    color = np.full((*w.shape[:2], 3), 128, np.uint8) if color is None else color
+    return estimate_noise(
+        w, local_median(w, valid), valid, color, color_median(color), True, NoiseConfig(**changes)
+    )
+
+
+def white(seed=0):
+    return SIGMA * np.random.default_rng(seed).normal(size=SHAPE)
+
+
+def test_window_residuals_are_those_of_a_plane_through_the_pixels():
+    rng = np.random.default_rng(0)
+    rows, cols = np.mgrid[:41, :61]
+    values = (0.5 + 0.01 * cols - 0.02 * rows + 0.1 * rng.normal(size=rows.shape)).astype(np.float32)
+    valid = rng.random(rows.shape) > 0.2
+    median = np.where(valid, values, 0).astype(np.float32)  # no impulse
+    out = np.empty((6, 3))
+    window_residuals(values, median, valid, 1.0, 20, out)
+    index = 0
+    for row0 in (0, 20):
+        for col0 in (0, 20, 40):
+            part = np.s_[row0 : row0 + WINDOW_PX, col0 : col0 + WINDOW_PX]
+            use = valid[part]
+            table = np.column_stack([np.ones(use.sum()), rows[part][use], cols[part][use]])
+            found = values[part][use].astype(float)
+            rest = found - table @ np.linalg.lstsq(table, found, rcond=None)[0]
+            assert out[index, 0] == pytest.approx(found.mean(), rel=1e-6)
+            assert out[index, 1] == pytest.approx(np.sqrt((rest**2).sum() / (use.sum() - 3)), rel=1e-5)
+            image = np.zeros(use.shape)
+            image[use] = rest
+            squares = []
+            for r in range(0, WINDOW_PX - BLOCK_PX + 1, BLOCK_PX):
+                for c in range(0, WINDOW_PX - BLOCK_PX + 1, BLOCK_PX):
+                    n = use[r : r + BLOCK_PX, c : c + BLOCK_PX].sum()
+                    if n >= 12:
+                        squares.append(image[r : r + BLOCK_PX, c : c + BLOCK_PX].sum() ** 2 / n)
+            assert out[index, 2] == pytest.approx(np.mean(squares), rel=1e-4)
+            index += 1
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_white_noise_is_measured_within_ten_percent(seed):
+    noise = estimated(room() + white(seed))
+    for w in (0.3, 0.4, 0.55):
+        assert noise.range_sigma(np.array(w)) == pytest.approx(SIGMA, rel=0.1)
+    assert noise.range_correlation == pytest.approx(1.0, abs=0.3)
+    assert noise.source == "estimated"
+
+
+def test_impulses_in_a_fifth_of_the_pixels_do_not_matter():
+    rng = np.random.default_rng(1)
+    w = room() + white()
+    wild = rng.random(SHAPE) < 0.2
+    w[wild] = rng.uniform(0.1, 1.0, wild.sum())
+    noise = estimated(w)
+    for value in (0.3, 0.4):
+        assert noise.range_sigma(np.array(value)) == pytest.approx(SIGMA, rel=0.25)
+
+
+def test_drop_out_of_a_third_of_the_pixels_does_not_matter():
+    noise = estimated(room() + white(), np.random.default_rng(2).random(SHAPE) > 0.3)
+    for value in (0.3, 0.4):
+        assert noise.range_sigma(np.array(value)) == pytest.approx(SIGMA, rel=0.1)
+
+
+@pytest.mark.parametrize(("step", "within"), [(2e-3, 0.2), (3e-3, 0.35), (6e-3, 0.6)])
+def test_quantised_depth_does_not_give_zero(step, within):
+    """Steps far above the noise: second differences are mostly zero, window residuals are step / sqrt(12).
+
+    Plateaus wider than a window (here 30 px at the coarsest step) show less of their steps.
+    """
+    noise = estimated(np.round((room() + 0.1 * white()) / step) * step)
+    assert noise.range_sigma(np.array(0.35)) == pytest.approx(step / np.sqrt(12), rel=within)
+
+
+def test_an_exact_frame_has_the_floor_and_not_zero():
+    noise = estimated(room())
+    typical = np.median(room())
+    assert (noise.range_sigma(room()) >= 0.5 * RELATIVE_FLOOR * typical).all()
+    assert noise.range_sigma(np.array(typical)) < 1e-4
+    assert (noise.color == COLOR_FLOOR_LEVELS).all()
+
+
+def test_correlated_noise_is_detected():
+    """Blurred by a Gaussian of 1.5 px, 4 pi 1.5^2 = 28 pixels carry one number; 5x5 blocks can tell up to 25."""
+    correlated = cv2.GaussianBlur(white(), (0, 0), 1.5)
+    correlated *= SIGMA / correlated.std()
+    noise = estimated(room() + correlated)
+    assert 8 < noise.range_correlation <= 25
+    assert noise.range_sigma(np.array(0.35)) == pytest.approx(SIGMA, rel=0.15)
+    mild = cv2.GaussianBlur(white(), (0, 0), 0.6)
+    mild *= SIGMA / mild.std()
+    assert 1.5 < estimated(room() + mild).range_correlation < noise.range_correlation
+
+
+def test_noise_that_grows_with_depth_is_followed():
+    """Constant noise of depth, sigma_w = sigma_z w^2: four times as much at twice the inverse depth."""
+    rows, _ = np.mgrid[: SHAPE[0] * 2, : SHAPE[1]]
+    w = 0.3 + 0.5 * rows / rows.max()
+    w = w + 0.004 * w**2 * np.random.default_rng(0).normal(size=w.shape)
+    noise = estimated(w)
+    for value in (0.35, 0.5, 0.7):
+        assert noise.range_sigma(np.array(value)) == pytest.approx(0.004 * value**2, rel=0.15)
+
+
+def test_colour_noise_is_measured_by_channel_and_has_a_floor():
+    rng = np.random.default_rng(0)
+    base = np.full((*SHAPE, 3), 128.0)
+    base[:, 150:] = 90
+    color = np.clip(base + rng.normal(0, [3.0, 6.0, 0.2], base.shape), 0, 255).round().astype(np.uint8)
+    noise = estimated(room() + white(), color=color)
+    assert noise.color[0] == pytest.approx(3, rel=0.1)
+    assert noise.color[1] == pytest.approx(6, rel=0.1)
+    assert noise.color[2] == COLOR_FLOOR_LEVELS
+    assert (estimated(room(), color=color, color_sigma=5.5).color == 5.5).all()
+
+
+def test_constant_noise_is_a_law_of_inverse_depth():
+    noise = estimated(room() + white(), range_model="constant", range_sigma=0.003)
+    w = np.array([0.25, 0.5, 1.0])
+    np.testing.assert_allclose(noise.range_sigma(w), 0.003 * w**2)
+    assert noise.source == "constant"
+
+
+@pytest.mark.parametrize(
+    ("model", "sigma_z"),
+    [
+        ("kinect_v1", lambda z: 0.0012 + 0.0019 * (z - 0.4) ** 2),  # Nguyen, Izadi & Lovell 2012
+        ("realsense_d435", lambda z: z**2 * 0.1 / (640 * 0.05)),
+    ],
+)
+def test_sensor_models_are_those_of_their_sources(model, sigma_z):
+    noise = estimated(room() + white(), range_model=model)
+    z = np.array([0.6, 1.0, 2.0, 4.0])
+    np.testing.assert_allclose(noise.range_sigma(1 / z) * z**2, sigma_z(z), rtol=2e-3)
+    assert model in SENSOR_MODELS
+
+
+@pytest.mark.parametrize("model", ["constant", "kinect_v1", "realsense_d435", "auto"])
+def test_scanner_grids_have_one_sigma_a_channel(model):
+    rows, cols = np.mgrid[:120, :160]
+    rng = np.random.default_rng(0)
+    points = np.stack([cols * 0.002, rows * 0.002, np.full(rows.shape, 1.5)], -1)
+    points += rng.normal(0, [5e-4, 1e-3, 2e-3], points.shape)
+    frame = RangeColorFrame(points.astype(np.float32), np.full((120, 160, 3), 90, np.uint8), None)
+    config = SegmenterConfig().replace({"noise.range_model": model, "noise.range_sigma": 0.004})
+    noise = build_signals(frame, frame.color, config).noise
+    assert noise.range_law.shape == (3, 3)
+    assert not noise.range_law[:, 1:].any()
+    sigma = noise.range_law[:, 0]
+    wanted = {
+        "constant": [0.004] * 3,
+        "kinect_v1": [0.0012 + 0.0019 * 1.1**2] * 3,
+        "realsense_d435": [1.5**2 * 0.1 / 32] * 3,
+        "auto": [6e-4, 1e-3, 2e-3],  # x is held to 0.3 of the noisiest
+    }[model]
+    np.testing.assert_allclose(sigma, wanted, rtol=0.12 if model == "auto" else 5e-3)
+
+
+@pytest.mark.parametrize("shape", [(3, 3), (20, 20), (21, 400)])
+def test_images_too_small_to_measure_fall_back_to_the_floor(shape):
+    w = np.full(shape, 0.5) + 1e-3 * np.random.default_rng(0).normal(size=shape)
+    noise = estimated(w)
+    assert np.isfinite(noise.range_law).all()
+    assert (noise.range_sigma(w) > 0).all()
