@@ -168,7 +168,7 @@ class GroupingConfig:
         unit="fraction of relief", low=0.0, high=1.0,
     )  # fmt: skip
     noise_share: float = _param(
-        0.6, "systematic part of the noise that more pixels do not average away", unit="sigma", low=0.0, high=10.0
+        0.4, "systematic part of the noise that more pixels do not average away", unit="sigma", low=0.0, high=10.0
     )
     edge_gate: bool = _param(
         True, "scale the tolerance by the share of the common boundary that crosses no detected edge"
