@@ -62,7 +62,13 @@ setup(
         "mcap>=1.1",
     ],
     extras_require={
-        "test": ["pytest>=8.0", "hypothesis>=6.90", "mcap-ros2-support>=0.5", "imgviz>=2.0"],
+        "test": [
+            "pytest>=8.0",
+            "hypothesis>=6.90",
+            "mcap-ros2-support>=0.5",
+            "imgviz>=2.0",
+            "foxglove-sdk>=0.16",
+        ],
         "dev": ["ruff>=0.6", "mypy>=1.10", "import-linter>=2.0", "codespell>=2.2", "pre-commit>=3.5"],
         "view": ["foxglove-sdk>=0.16"],
         "ros": ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"],
