@@ -70,7 +70,8 @@ class Partition:
 
     def moments(self, signals: Signals, degree: int) -> Moments:
         """Moments of the regions for models up to `degree` or more; grouping may add them up in place."""
-        if self._moments is None or self._moments.cross.shape[2] <= degree:
+        kept = self._moments
+        if kept is None or kept.cross.shape[2] <= degree or kept.cross.shape[1] != signals.image.shape[2]:
             self._moments = accumulate(signals.image, signals.flags, self.labels, self.count, degree)
         return self._moments
 
