@@ -101,7 +101,7 @@ class EdgesConfig:
     """Morphological depth, orientation and colour discontinuities (section 8; Boulanger, Blais & Cohen 1990)."""
 
     depth_threshold: float = _param(
-        6.0, "step of the range signal that is a depth discontinuity, beside depth_step", unit="sigma",
+        10.0, "step of the range signal that is a depth discontinuity, beside depth_step", unit="sigma",
         low=1.0, high=1000.0,
     )  # fmt: skip
     depth_step: float = _param(

@@ -91,9 +91,14 @@ def normalize_reflectance(
         with np.errstate(invalid="ignore", divide="ignore"):
             albedo = frame.color * factor[..., None] / incident * 255.0  # eq. (7)
             known = np.isfinite(albedo)
-            typical = np.nanmedian(np.where(known & (frame.color > 0), albedo / frame.color, np.nan))
+            typical = _median((albedo / frame.color)[known & (frame.color > 0)])
         albedo = np.where(known, albedo, frame.color * typical)
     else:
-        typical = float(np.nanmedian(factor))
+        typical = _median(factor[np.isfinite(factor)])
         albedo = frame.color * (np.where(np.isfinite(factor), factor, typical) / typical)[..., None]
     return np.clip(np.rint(albedo), 0, 255).astype(np.uint8)
+
+
+def _median(factors: NDArray[Any]) -> float:
+    """The median, or 1 (no correction) where nothing is known."""
+    return float(np.median(factors)) if factors.size else 1.0

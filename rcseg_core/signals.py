@@ -24,6 +24,8 @@ from rcseg_core.noise import NoiseModel, estimate_noise
 INVALID, RANGE_OUTLIER, COLOR_OUTLIER = 1, 2, 4
 #: Has the label of a neighbour although no model predicts it: counts for no fit.
 MISFIT = 8
+#: Half of the window of the local median.
+RIM_PX = 2
 
 
 @dataclass(frozen=True)
@@ -151,6 +153,30 @@ def _slope(
 
 
 @bare
+def _on_rim_slope(raw, median, row, col, scale, limit):  # type: ignore[no-untyped-def]
+    """Whether a pixel at the rim of the image is near its surface continued from inside.
+
+    The window of the median is one-sided there, so that on a slope the median lies off the surface.
+    """
+    height, width, n_range = raw.shape
+    r = min(max(row, RIM_PX), height - 1 - RIM_PX)
+    c = min(max(col, RIM_PX), width - 1 - RIM_PX)
+    if (r == row and c == col) or min(height, width) < 5 * RIM_PX:
+        return False
+    step_r = (row < RIM_PX) - (row >= height - RIM_PX)  # one pixel inwards
+    step_c = (col < RIM_PX) - (col >= width - RIM_PX)
+    far = 0.0
+    for k in range(n_range):
+        center = np.float64(median[r, c, k])
+        slope_r = 0.5 * (median[r + 2 * step_r, c, k] - center)
+        slope_c = 0.5 * (median[r, c + 2 * step_c, k] - center)
+        expected = center - slope_r * abs(row - r) - slope_c * abs(col - c)
+        d = (raw[row, col, k] - expected) / scale[k]
+        far = max(far, d * d)
+    return far <= limit
+
+
+@bare
 def whiten(raw, median_r, color, median_c, valid, scale, offset, law, threshold, image, cleaned, flags):  # type: ignore[no-untyped-def]
     """Whiten a frame into `image`, flag impulses, and put the local median in their place in `cleaned`.
 
@@ -176,7 +202,9 @@ def whiten(raw, median_r, color, median_c, valid, scale, offset, law, threshold,
                     image[row, col, c] = 0.0
             else:
                 var, _ = local_scales(law, np.float64(cleaned[row, col, 0]))
-                if threshold > 0.0 and far > limit * var:
+                if threshold > 0.0 and far > limit * var and not _on_rim_slope(
+                    raw, median_r, row, col, scale, limit * var
+                ):
                     flag = RANGE_OUTLIER
                 else:
                     for c in range(n_range):

@@ -74,19 +74,11 @@ def test_a_crease_is_found_where_it_is_and_nowhere_else():
     assert near(valley, ORIENTATION, 160, 3) > 0.8
 
 
-NOISY_STEPS = (
-    "on a slope of more than a sigma a pixel the Laplacian of white noise has a deviation of 2.45 sigma, so that 6 sigma"
-    " fire on 1.4 % of the pixels; each of them silences creases within 11 px"
-)
-
-
-@pytest.mark.xfail(strict=True, reason=NOISY_STEPS)
 def test_white_noise_on_a_steep_plane_rarely_makes_a_step():
     edges = edges_of(BASE + 2.0 + 8e-3 * (COLS - 160), **{"edges.depth_step": 0.0})
     assert ((edges & DEPTH) > 0).mean() < 0.001
 
 
-@pytest.mark.xfail(strict=True, reason=NOISY_STEPS)
 def test_a_sharper_crease_is_found_as_surely():
     edges = edges_of(BASE + 8e-3 * np.abs(COLS - 160))
     assert near(edges, ORIENTATION | DEPTH, 160, 3) > 0.8
@@ -183,7 +175,6 @@ def test_scanner_grids_have_steps():
     assert ((edges[20:160, 20:-20] & DEPTH) > 0).mean() < 0.04
 
 
-@pytest.mark.xfail(strict=True, reason=NOISY_STEPS)
 def test_scanner_grids_have_creases():
     assert near(grid_edges(0.4), ORIENTATION, 160, 4) > 0.8
 
