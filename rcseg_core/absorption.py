@@ -134,13 +134,12 @@ def _refine(image, flags, labels, leaves, models, n_range, law, color_eps2, smoo
             k = labels[row, col]
             if k <= 0:
                 continue
-            border = False
-            for d in range(4):
-                r = row + (d == 1) - (d == 0)
-                c = col + (d == 3) - (d == 2)
-                if 0 <= r < height and 0 <= c < width and labels[r, c] > 0 and labels[r, c] != k:
-                    border = True
-            if not border:
+            if (
+                labels[max(row - 1, 0), col] == k
+                and labels[min(row + 1, height - 1), col] == k
+                and labels[row, max(col - 1, 0)] == k
+                and labels[row, min(col + 1, width - 1)] == k
+            ):
                 continue
             best = k
             best_cost = np.inf

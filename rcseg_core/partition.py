@@ -46,6 +46,14 @@ def count_pixels(labels, count):  # type: ignore[no-untyped-def]
     return sizes
 
 
+@bare
+def count_together(first, second, counts):  # type: ignore[no-untyped-def]
+    """counts[a, b] += pixels with label a in `first` and b in `second`."""
+    for row in range(first.shape[0]):
+        for col in range(first.shape[1]):
+            counts[first[row, col], second[row, col]] += 1
+
+
 class Partition:
     """Regions 1..count over the pixels (0 unassigned) and the tree that led to them."""
 

@@ -15,10 +15,10 @@ from rcseg_core.edges import RANGE_EDGES, detect_edges
 from rcseg_core.errors import ConfigError
 from rcseg_core.frame import RangeColorFrame
 from rcseg_core.models import Models
-from rcseg_core.partition import Partition
+from rcseg_core.partition import Partition, count_together
 from rcseg_core.reflectance import normalize_reflectance
 from rcseg_core.seeds import initial_partition
-from rcseg_core.segmentation import Segmentation, compact
+from rcseg_core.segmentation import Segmentation
 from rcseg_core.signals import INVALID, MISFIT, Signals, build_signals
 from rcseg_core.stages import absorb_small, coarser_merges, final_models, group_pass, surfaces_of, top_degree
 
@@ -195,19 +195,23 @@ def settle(partition: Partition, signals: Signals, config: SegmenterConfig) -> N
 
 def majority(partition: Partition, surfaces: Partition) -> NDArray[np.int64]:
     """(count + 1,) the surface that holds most of each region's pixels (the lowest of equals)."""
-    keys = partition.labels.astype(np.int64) * (surfaces.count + 1) + surfaces.labels
-    counts = np.bincount(keys.ravel(), minlength=(partition.count + 1) * (surfaces.count + 1))
-    return np.argmax(counts.reshape(partition.count + 1, -1), axis=1)
+    counts = np.zeros((partition.count + 1, surfaces.count + 1), np.int64)
+    count_together(partition.labels, surfaces.labels, counts)
+    return np.argmax(counts, axis=1)
 
 
 def number_surfaces(
     partition: Partition, surface_of: NDArray[np.int64]
 ) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
     """Surfaces numbered from the largest down: the label image, and the number of each region's surface."""
-    image = compact(surface_of[partition.labels])
-    number = np.zeros(partition.count + 1, np.int64)
-    number[partition.labels.ravel()] = image.ravel()
-    return image, number
+    sizes = np.bincount(surface_of, partition.sizes(), minlength=int(surface_of.max()) + 1)
+    sizes[surface_of[0]] -= partition.sizes()[0]
+    order = np.argsort(-sizes, kind="stable")
+    rank = np.empty(order.size, np.int64)
+    rank[order] = np.arange(1, order.size + 1)
+    number = rank[surface_of]
+    number[0] = 0
+    return number.astype(np.int32)[partition.labels], number
 
 
 def scaled(pixels: int, image: NDArray[np.uint8]) -> int:

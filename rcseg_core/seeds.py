@@ -17,6 +17,9 @@ from rcseg_core.config import SeedsConfig
 from rcseg_core.jit import kernel
 from rcseg_core.signals import Signals, local_scales
 
+#: Windows beyond the largest of the paper, tried first and taken only where plain least squares leaves pure noise:
+#: fewer seeds to group on wide plain surfaces.
+WIDE_WINDOWS_PX = (31, 19)
 #: A seed must keep this share of its usable pixels as inliers (LMS breaks down at half).
 MIN_INLIERS = 0.5
 #: Three pixels span a plane; two more tell whether it fits.
@@ -182,7 +185,7 @@ def _fits(samples, use, count, coef, n_range, var, eps2_r, eps2_c):  # type: ign
 
 
 @kernel
-def _try_window(image, flags, row0, col0, size, n_range, law, eps2_c, half, cut, robust, subsets, min_valid, work, labels, label):  # type: ignore[no-untyped-def]
+def _try_window(image, flags, row0, col0, size, n_range, law, eps2_c, half, cut, search, robust, subsets, min_valid, work, labels, label):  # type: ignore[no-untyped-def]
     """Fit one free window; write its inliers as `label`. Returns the number of pixels, 0 if it is no seed."""
     samples, coef, trial, res, use = work
     channels = image.shape[2]
@@ -204,7 +207,10 @@ def _try_window(image, flags, row0, col0, size, n_range, law, eps2_c, half, cut,
         return 0
     var, eps2_r = local_scales(law, coef[0, 0])
     # half of the tolerance, as for single pixels: a seed is held to more than a grown region
-    if robust or not _fits(samples, use, count, coef, n_range, var, 0.25 * eps2_r, 0.25 * eps2_c):
+    noise_only = _fits(samples, use, count, coef, n_range, var, 0.25 * eps2_r, 0.25 * eps2_c)
+    if not noise_only and not search:
+        return 0
+    if robust or not noise_only:
         w_r = 1.0 / (var + 0.25 * eps2_r / n_range)
         w_c = 1.0 / (1.0 + 0.25 * eps2_c / 3.0)
         state = np.uint64(88172645463325252) ^ np.uint64((row0 * 65536 + col0) * 64 + size)
@@ -232,7 +238,7 @@ def _try_window(image, flags, row0, col0, size, n_range, law, eps2_c, half, cut,
 
 
 @kernel
-def place_windows(image, flags, edges, n_range, law, eps2_c, sizes, half, cut, robust, subsets, min_valid, labels):  # type: ignore[no-untyped-def]
+def place_windows(image, flags, edges, n_range, law, eps2_c, sizes, max_window, half, cut, robust, subsets, min_valid, labels):  # type: ignore[no-untyped-def]
     """Fill `labels` (H, W) int32 with seeds 1..N; returns N. Windows in raster order, sizes largest first.
 
     A window is free when the last `size` columns each have a run of `size` rows without edge or seed above them.
@@ -261,8 +267,8 @@ def place_windows(image, flags, edges, n_range, law, eps2_c, sizes, half, cut, r
                 row0 = row - size + 1
                 col0 = col - size + 1
                 taken = _try_window(
-                    image, flags, row0, col0, size, n_range, law, eps2_c, half, cut, robust, subsets,
-                    min_valid, work, labels, count + 1,
+                    image, flags, row0, col0, size, n_range, law, eps2_c, half, cut,
+                    size <= max_window, robust and size <= max_window, subsets, min_valid, work, labels, count + 1,
                 )  # fmt: skip
                 if taken > 0:
                     count += 1
@@ -304,9 +310,11 @@ def initial_partition(
     blocked = edges if within is None else _fence(edges, within)
     top = min(config.max_window, *(s - 1 + s % 2 for s in labels.shape))
     sizes = np.arange(top, min(config.min_window, top) - 1, -2, dtype=np.int64)
+    if config.fit == "auto":
+        sizes = np.concatenate([[w for w in WIDE_WINDOWS_PX if top < w <= min(labels.shape)], sizes]).astype(np.int64)
     dims = signals.image.shape[2]
     count = place_windows(
-        signals.image, signals.flags, blocked, signals.n_range, signals.law, signals.color_eps2, sizes,
+        signals.image, signals.flags, blocked, signals.n_range, signals.law, signals.color_eps2, sizes, top,
         float(chi2.ppf(0.5, dims)), float(chi2.ppf(0.975, dims)), config.fit == "lms", config.subsets,
         config.min_valid, labels,
     )  # fmt: skip

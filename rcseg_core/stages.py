@@ -82,8 +82,11 @@ def group_pass(
     with "region" (the paper) each region has the degree that its own tests support.
     """
     general = config.generalization
-    moments = partition.moments(signals, degree)
-    tested = tested_degrees(moments, signals, degree, config)
+    stored = degree if degree == 1 else top_degree(signals, config)  # later passes go on with the same sums
+    moments = partition.moments(signals, stored)
+    tested = np.ones((partition.count + 1, 2), np.int64)
+    if degree > 1:
+        tested = tested_degrees(moments, signals, degree, config)
     pair = general.hypothesis == "pair"
     tried = tested
     if pair:
@@ -96,7 +99,7 @@ def group_pass(
     if planes:
         add_merged(moments, grouped.merges)
     alive = partition.apply(grouped)
-    return fit_models(partition.moments(signals, degree), rule.degree[alive], signals.n_range, planes)
+    return fit_models(partition.moments(signals, stored), rule.degree[alive], signals.n_range, planes)
 
 
 def curved_regions(moments: Moments, signals: Signals) -> NDArray[np.bool_]:
