@@ -90,8 +90,8 @@ def pixel_cost(models, k, image, flags, row, col, n_range, law, color_eps2):  # 
             d = image[row, col, c] - predict(models, k, row, col, 0, c)
             total += d * d
         cost += total / (var + 0.25 * eps2 / n_range)
-    if flags[row, col] & COLOR_OUTLIER == 0:
-        channels = image.shape[2]
+    channels = image.shape[2]
+    if channels > n_range and flags[row, col] & COLOR_OUTLIER == 0:
         total = 0.0
         for c in range(n_range, channels):
             d = image[row, col, c] - predict(models, k, row, col, 1, c)

@@ -211,7 +211,7 @@ def _try_window(image, flags, row0, col0, size, n_range, law, eps2_c, half, cut,
     if not noise_only and not search:
         return 0
     if robust or not noise_only:
-        w_r = 1.0 / (var + 0.25 * eps2_r / n_range)
+        w_r = 1.0 / (var + 0.25 * eps2_r / max(n_range, 1))  # colour alone has no range residual
         w_c = 1.0 / (1.0 + 0.25 * eps2_c / 3.0)
         state = np.uint64(88172645463325252) ^ np.uint64((row0 * 65536 + col0) * 64 + size)
         inliers = lms_inliers(
