@@ -25,6 +25,7 @@ from rcseg_core.jit import kernel
 WINDOW_PX = 21
 #: Windows to a side of the image that are enough for its quantiles; small images overlap them.
 WINDOWS_A_SIDE = 16
+COLOR_WINDOWS_A_SIDE = 10
 BLOCK_PX = 5
 #: Mean square of block means over variance / BLOCK_PX^2 on white noise: the plane takes a little of it.
 WHITE_BLOCKS = 0.84
@@ -162,11 +163,12 @@ class _Windows(NamedTuple):
 
 
 def _measure(
-    values: NDArray[np.float32], median: NDArray[np.float32], valid: NDArray[np.bool_]
-) -> _Windows:
+    values: NDArray[np.float32], median: NDArray[np.float32], valid: NDArray[np.bool_],
+    windows_a_side: int = WINDOWS_A_SIDE,
+) -> _Windows:  # fmt: skip
     """Residuals of all windows of one channel."""
     height, width = values.shape
-    stride = max(8, min(height, width) // WINDOWS_A_SIDE)
+    stride = max(8, min(height, width) // windows_a_side)
     count = max(0, (height - WINDOW_PX) // stride + 1) * max(0, (width - WINDOW_PX) // stride + 1)
     table = np.full((count, 4), np.nan)
     away = np.abs(values[::3, ::3] - median[::3, ::3])[valid[::3, ::3]]
@@ -256,9 +258,12 @@ def estimate_noise(
         law = np.array([(sigma_m, 0.0, 0.0)] * 3)
     everywhere = np.ones(color.shape[:2], np.bool_)
     colors = [
-        _measure(color[..., c].astype(np.float32), color_median[..., c].astype(np.float32), everywhere)
+        _measure(
+            color[..., c].astype(np.float32), color_median[..., c].astype(np.float32), everywhere,
+            COLOR_WINDOWS_A_SIDE,
+        )
         for c in range(3)
-    ]
+    ]  # fmt: skip
     sigma_c = np.maximum([_quiet_rms(w.rms) for w in colors], COLOR_FLOOR_LEVELS)
     if config.color_sigma > 0:
         sigma_c = np.full(3, config.color_sigma)

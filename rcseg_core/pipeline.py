@@ -91,14 +91,9 @@ def segment(
         surface_of = majority(partition, surfaces)
     surface_labels, surface_of = number_surfaces(partition, surface_of)
     clock.lap("models")
-    regions = describe_regions(
-        frame, signals, partition.labels, surface_of, moments, models, boxes, pairs
-    )
-    clock.lap("describe")
     return Segmentation(
         labels=partition.labels,
         surface_labels=surface_labels,
-        regions=regions,
         tree=partition.tree.build(),
         range_tree=surfaces.tree.build() if surfaces is not None else None,
         edges=edges,
@@ -110,6 +105,9 @@ def segment(
         range_leaves=surfaces.leaves if surfaces is not None else None,
         nodes=partition.nodes,
         coarsen=partial(coarser_merges, signals, moments, boxes, pairs, config),
+        describe=partial(
+            describe_regions, frame, signals, partition.labels, surface_of, moments, models, boxes, pairs
+        ),
     )
 
 
@@ -150,12 +148,14 @@ def partition_by(
         for degree in higher:
             models = group_pass(partition, signals, edges, degree, config)
         clock.lap(f"{name} generalize")
-        if config.absorption.enabled:
-            if round_ == 0:
-                settle(partition, signals, config)
+        if not config.absorption.enabled:
+            break
+        if round_ == 0:
+            settle(partition, signals, config)
+        if within is None:  # within surfaces, both signals judge small regions later
             absorb_small(partition, signals, edges, config)
-            clock.lap(f"{name} absorb")
-        if partition.count == before:
+        clock.lap(f"{name} absorb")
+        if within is not None or partition.count == before:
             break
     return partition
 

@@ -53,7 +53,6 @@ class Segmentation:
     ----------
     labels : (H, W) int32; 0 unlabelled, 1..N regions of one surface and one colour model, largest first
     surface_labels : (H, W) int32; 0 unlabelled, 1..M continuous surfaces, unions of regions
-    regions : sequence of Region, ``regions[i].label == i + 1``
     edges : (H, W) uint8 bit mask: depth 1, orientation 2, colour 4
     noise : the NoiseModel that was used
     timings : seconds by stage, in order
@@ -62,7 +61,6 @@ class Segmentation:
 
     labels: NDArray[np.int32]
     surface_labels: NDArray[np.int32]
-    regions: Sequence[Region]
     edges: NDArray[np.uint8]
     timings: dict[str, float]
     camera: PinholeCamera | None
@@ -74,11 +72,17 @@ class Segmentation:
     range_leaves: NDArray[np.int32] | None = field(repr=False)
     nodes: NDArray[np.int64] = field(repr=False)
     coarsen: Callable[[], Grouped] = field(repr=False)
+    describe: Callable[[], Sequence[Region]] = field(repr=False)
 
     @property
     def noise(self):  # type: ignore[no-untyped-def]
         """The NoiseModel of this frame."""
         return self.signals.noise
+
+    @cached_property
+    def regions(self) -> Sequence[Region]:
+        """All regions, ``regions[i].label == i + 1``; described on first use."""
+        return self.describe()
 
     @cached_property
     def hierarchy(self) -> Hierarchy:
