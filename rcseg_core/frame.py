@@ -17,6 +17,10 @@ from numpy.typing import NDArray
 from rcseg_core.errors import InputError
 
 
+#: No range sensor measures nearer or farther; beyond, float32 cannot hold the signals. Such pixels are invalid.
+MIN_DEPTH_M, MAX_DEPTH_M = 1e-9, 1e9
+
+
 @dataclass(frozen=True)
 class PinholeCamera:
     """A pinhole camera in pixels: ``col = fx x/z + cx``, ``row = fy y/z + cy`` (optical frame).
@@ -57,7 +61,7 @@ class RangeColorFrame:
     Parameters
     ----------
     points : (H, W, 3) float32 or float64, metres, optical frame
-        NaN, infinite or z = 0 marks an invalid pixel.
+        NaN, infinite or z = 0 marks an invalid pixel; so does a depth beyond MIN_DEPTH_M and MAX_DEPTH_M.
     color : (H, W, 3) uint8, RGB
     camera : PinholeCamera or None
         None for scanner grids: the range signal is then x, y, z.
@@ -128,10 +132,12 @@ class RangeColorFrame:
 
     @cached_property
     def valid(self) -> NDArray[np.bool_]:
-        """(H, W) bool: finite points; with a camera also in front of it."""
+        """(H, W) bool: finite points that a sensor can give; with a camera also in front of it."""
         z = self.points[..., 2]
-        finite = np.isfinite(self.points).all(axis=2) if self.camera is None else np.isfinite(z)
-        return finite & (z > 0) if self.camera is not None else finite & (z != 0)
+        finite = np.isfinite(self.points).all(axis=2)
+        if self.camera is None:
+            return finite & (z != 0) & (np.abs(self.points).max(axis=2) <= MAX_DEPTH_M)
+        return finite & (z >= MIN_DEPTH_M) & (z <= MAX_DEPTH_M)
 
 
 def _what(value: object) -> str:

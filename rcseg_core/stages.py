@@ -202,4 +202,4 @@ def coarser_merges(
     degree = np.full((count + 1, 2), config.generalization.max_range_degree, np.int64)
     degree[:, 1] = config.generalization.max_color_degree
     rule = make_rule(signals, degree, config)._replace(earn=False)
-    return group(_copy(moments), boxes.copy(), pairs, rule, config.grouping.edge_gate, limit=NO_LIMIT)
+    return group(_copy(moments), boxes.copy(), pairs, rule, gated=False, limit=NO_LIMIT)

@@ -87,7 +87,6 @@ def test_any_bad_coordinate_marks_a_pixel_invalid(channel, camera, bad):
     assert np.argwhere(~RangeColorFrame(points, COLOR, camera).valid).tolist() == [[1, 2]]
 
 
-@pytest.mark.xfail(strict=True, reason="with a camera only z is looked at: NaN in x or y reaches the centroids")
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 @pytest.mark.parametrize("channel", [0, 1])
 def test_with_a_camera_as_well(channel, bad):
