@@ -6,7 +6,9 @@ from rcseg_core.noise import NoiseModel
 from rcseg_core.signals import Signals
 
 
-def crafted_signals(image, n_range=1, *, flags=None, eps=0.0, color_eps=0.0, inverse_depth=True, correlation=1.0):
+def crafted_signals(
+    image, n_range=1, *, flags=None, eps=0.0, color_eps=0.0, inverse_depth=True, correlation=1.0
+):
     """Signals of a whitened (H, W, C) image: unit noise everywhere, tolerances in sigmas, unit scales."""
     image = np.ascontiguousarray(image, np.float32)
     channels = image.shape[2]

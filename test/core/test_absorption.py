@@ -35,7 +35,9 @@ def scene(seed, share=0.4):
 
 def price(signals, models, max_cost):
     def cost(k, row, col):
-        value = pixel_cost(models, k, signals.image, signals.flags, row, col, 1, signals.law, signals.color_eps2)
+        value = pixel_cost(
+            models, k, signals.image, signals.flags, row, col, 1, signals.law, signals.color_eps2
+        )
         impulse = signals.flags[row, col] & (RANGE_OUTLIER | COLOR_OUTLIER)
         return value + (IMPULSE_SHARE * max_cost if impulse else 0.0)
 
@@ -76,7 +78,7 @@ def test_growth_never_takes_invalid_pixels_nor_crosses_within(seed):
 
 
 def test_nothing_is_absorbed_that_costs_more_than_the_limit():
-    signals, labels, within, models = scene(1)
+    signals, labels, _, models = scene(1)
     cost = price(signals, models, 9.0)
     before = labels.copy()
     absorb(signals, labels, labels.copy(), models, 9.0)
@@ -86,7 +88,7 @@ def test_nothing_is_absorbed_that_costs_more_than_the_limit():
 
 
 def energy(signals, labels, models):
-    """What refinement lowers: costs of the pixels plus disagreeing neighbours, each pair counted from both sides."""
+    """What refinement lowers: costs of the pixels plus disagreeing neighbours, counted from both sides."""
     total = 0.0
     for row in range(SHAPE[0]):
         for col in range(SHAPE[1]):

@@ -78,9 +78,13 @@ def test_elevation_leaves_the_surface(control, u, v):
 @given(st.sampled_from(DEGREES).flatmap(controls), st.floats(0, 0.5), st.floats(0.6, 1.5), UNIT, UNIT)
 def test_subdivision_leaves_the_surface(control, t0, t1, u, v):
     along_u = subdivide(control, t0, t1, axis=0)
-    np.testing.assert_allclose(value(along_u, u, v), value(control, t0 + (t1 - t0) * u, v), rtol=1e-8, atol=1e-6)
+    np.testing.assert_allclose(
+        value(along_u, u, v), value(control, t0 + (t1 - t0) * u, v), rtol=1e-8, atol=1e-6
+    )
     along_v = subdivide(control, t0, t1, axis=1)
-    np.testing.assert_allclose(value(along_v, u, v), value(control, u, t0 + (t1 - t0) * v), rtol=1e-8, atol=1e-6)
+    np.testing.assert_allclose(
+        value(along_v, u, v), value(control, u, t0 + (t1 - t0) * v), rtol=1e-8, atol=1e-6
+    )
 
 
 @given(st.sampled_from(DEGREES).flatmap(controls), UNIT, UNIT)

@@ -1,4 +1,4 @@
-"""Holes are filled for the filters only, impulses flagged and nothing else (and the whitened image is right)."""
+"""Holes are filled for the filters only; medians resist impulses."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The configuration: round trips, every bound, and errors that name the key, the value and what is allowed."""
+"""The configuration: round trips, every bound, errors that name the key, the value and what is allowed."""
 
 import dataclasses
 
@@ -134,7 +134,10 @@ def test_a_fraction_is_no_whole_number(key):
 @pytest.mark.parametrize("key", BOOLS)
 def test_truth_values_have_words(key):
     group, name = key.split(".")
-    for words, wanted in ((("true", "Yes", "on", "1", True), True), (("false", "NO", "off", "0", False), False)):
+    for words, wanted in (
+        (("true", "Yes", "on", "1", True), True),
+        (("false", "NO", "off", "0", False), False),
+    ):
         for word in words:
             assert getattr(getattr(SegmenterConfig().replace({key: word}), group), name) is wanted
     refused(key, "maybe")
@@ -169,7 +172,10 @@ def test_unknown_keys_are_named_with_a_hint(key, hint):
         ({"grouping": 3}, "grouping: expected a mapping of parameters, got 3"),
         ([1, 2], "a configuration is a mapping of groups, got list"),
         (None, "a configuration is a mapping of groups, got NoneType"),
-        ({"seeds": {"min_window": 9, "max_window": 5}}, "seeds.min_window = 9 is larger than seeds.max_window = 5"),
+        (
+            {"seeds": {"min_window": 9, "max_window": 5}},
+            "seeds.min_window = 9 is larger than seeds.max_window = 5",
+        ),
         ({3: {4: 5}}, "unknown parameter 3.4"),
     ],
 )

@@ -17,7 +17,7 @@ CURVED = np.array([False, True, True])
 
 def joined(value, curved=CURVED, degree=2, edges=None, split=44, sliver_px=0.0, eps=1.0):
     """Region 1 left of `split`, region 2 right of it; range only, in sigmas. Returns the merges."""
-    labels = np.where(COLS < split, 1, 2).astype(np.int32)
+    labels = np.where(split > COLS, 1, 2).astype(np.int32)
     signals = crafted_signals(value[..., None], 1, eps=eps)
     moments = accumulate(signals.image, signals.flags, labels, 2, degree)
     models = fit_models(moments, np.full((3, 2), degree), 1)
@@ -29,7 +29,9 @@ def joined(value, curved=CURVED, degree=2, edges=None, split=44, sliver_px=0.0, 
 def test_tangent_is_the_polynomial_and_its_derivatives():
     rng = np.random.default_rng(0)
     labels = np.ones(SHAPE, np.int32)
-    moments = accumulate(rng.normal(size=(*SHAPE, 2)).astype(np.float32), labels.astype(np.uint8) * 0, labels, 1, 3)
+    moments = accumulate(
+        rng.normal(size=(*SHAPE, 2)).astype(np.float32), labels.astype(np.uint8) * 0, labels, 1, 3
+    )
     models = fit_models(moments, np.full((2, 2), 3), 2)
     for row, col in ((3.0, 4.0), (20.5, 60.0)):
         value, by_x, by_y = tangent(models, 1, row, col, 1)
@@ -58,7 +60,7 @@ def test_a_step_parts_them():
 
 
 def test_a_crease_parts_them():
-    """10 whitened units per UNIT_PX are 45 degrees in `crafted_signals`: here it turns from 42 to -60 degrees."""
+    """10 units per UNIT_PX are 45 degrees in `crafted_signals`: here it turns from 42 to -60 degrees."""
     kink = np.maximum(COLS - 43.5, 0) * -27.0 / UNIT_PX
     assert joined(bowl() + kink) == []
     assert joined(bowl() + 0.1 * kink) == [[1, 2]]

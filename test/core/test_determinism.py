@@ -23,7 +23,8 @@ family, seed, width, height, literal, threads = sys.argv[1:]
 import cv2; cv2.setNumThreads(int(threads))
 frame = make_scene(family, int(seed), width=int(width), height=int(height)).frame
 result = segment(frame, SegmenterConfig.literal() if literal == "literal" else SegmenterConfig())
-digest = hashlib.sha256(result.labels.tobytes() + result.surface_labels.tobytes() + result.labels_at(3.0).tobytes())
+parts = (result.labels, result.surface_labels, result.labels_at(3.0))
+digest = hashlib.sha256(b"".join(part.tobytes() for part in parts))
 print(digest.hexdigest())
 """
 

@@ -1,4 +1,4 @@
-"""Edges: zero on planes however oblique, firing on creases, steps and colours, and rarely on noise (section 8)."""
+"""Edges: zero on planes however oblique, firing on creases, steps and colours, rarely on noise."""
 
 import cv2
 import numpy as np
@@ -160,9 +160,11 @@ def test_colour_edges_are_also_found_where_there_is_no_range():
 
 
 def grid_edges(slope, step=0.0):
-    """A scanner grid of 1 mm pitch and 0.3 mm noise: a fold with `slope` on both sides and a step of height `step`."""
+    """A scanner grid of 1 mm pitch and 0.3 mm noise: a fold of `slope` on both sides, a step of `step`."""
     rng = np.random.default_rng(0)
-    points = np.stack([COLS * 1e-3, ROWS * 1e-3, 0.5 + slope * 1e-3 * np.abs(COLS - 160) + step * (ROWS > 180)], -1)
+    points = np.stack(
+        [COLS * 1e-3, ROWS * 1e-3, 0.5 + slope * 1e-3 * np.abs(COLS - 160) + step * (ROWS > 180)], -1
+    )
     points += rng.normal(0, 3e-4, points.shape)
     frame = RangeColorFrame(points, np.full((*SHAPE, 3), 90, np.uint8), None)
     config = SegmenterConfig()

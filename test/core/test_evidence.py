@@ -25,7 +25,7 @@ EPS, COLOR_EPS = 1.5, 3.0
 
 
 def scene(seed=0, bend=0.0, step=0.0, n_range=1):
-    """Region 1 (large) and 2 (small) side by side; noise 1, bent by `bend`, parted by `step` in every channel."""
+    """Region 1 (large) and 2 (small) side by side; noise 1, bent by `bend`, parted by `step`."""
     rng = np.random.default_rng(seed)
     rows, cols = np.mgrid[: SHAPE[0], : SHAPE[1]]
     labels = np.zeros(SHAPE, np.int32)
@@ -64,7 +64,7 @@ def compared(signals, labels, degrees=(1, 1), gates=(1.0, 1.0), kind=None, order
 
 
 def bounded_by_hand(pixels, exponents, rule, gates, whole=False):
-    """The inequality of the module's first lines, from pixel fits: (largest ratio, multiple of the tolerance)."""
+    """The inequality of the module's first lines from pixel fits: (ratio, multiple of the tolerance)."""
     x, y, values, label = pixels
     everything, ratio, need = np.ones(label.size, bool), 0.0, 0.0
     n_range = rule.n_range

@@ -22,7 +22,12 @@ COLOR = np.zeros((6, 8, 3), np.uint8)
         (POINTS, COLOR[..., 0], None, "color: expected an array of shape (H, W, 3), got shape (6, 8)"),
         (POINTS, COLOR.tolist(), None, "color: expected an array of shape (H, W, 3), got list"),
         (POINTS, COLOR.astype(float), None, "color: expected uint8 RGB, got float64"),
-        (POINTS, COLOR[:5], None, "points are 8x6 and color is 8x5: both must be registered in one pixel grid"),
+        (
+            POINTS,
+            COLOR[:5],
+            None,
+            "points are 8x6 and color is 8x5: both must be registered in one pixel grid",
+        ),
         (POINTS[:2], COLOR[:2], None, "the image is 8x2: at least 3x3 pixels are needed"),
         (POINTS[:, :1], COLOR[:, :1], None, "the image is 1x6: at least 3x3 pixels are needed"),
         (POINTS, COLOR, "camera", "camera: expected a PinholeCamera or None, got str"),

@@ -85,7 +85,7 @@ def test_a_plane_stays_one_and_range_and_colour_choose_apart():
     assert chosen(measured(surface(lambda x, y: 20 * x * x))[1]).tolist() == [2, 1]
     assert chosen(measured(surface(lambda x, y: 20 * x**4 - 15 * x * x))[1]).tolist() == [4, 1]
     assert chosen(measured(surface(lambda x, y: 20 * x**3))[1]).tolist() == [3, 1]
-    image, moments = measured(surface()[..., [1, 0, 0]] + surface(lambda x, y: 9 * x * y * y)[..., [2, 0, 0]])
+    _, moments = measured(surface()[..., [1, 0, 0]] + surface(lambda x, y: 9 * x * y * y)[..., [2, 0, 0]])
     assert chosen(moments).tolist() == [1, 2]
 
 
@@ -110,7 +110,7 @@ def test_degrees_have_tops_and_need_pixels():
 
 def test_correlated_pixels_count_for_fewer():
     """What 1920 independent pixels would prove, 1920 pixels worth 77 do not."""
-    image, moments = measured(surface(lambda x, y: 0.5 * x * x))
+    _, moments = measured(surface(lambda x, y: 0.5 * x * x))
     start = np.ones((2, 2), np.int64)
     config = GeneralizationConfig(test="f", alpha=1e-3)
     white = choose_degrees(moments, 1, start, np.ones((2, 2)), WHITE, config)

@@ -1,4 +1,4 @@
-"""Best-first grouping against a grouper that looks at every pair anew each time; the heap; what must always hold."""
+"""Best-first grouping against a grouper that looks at every pair anew each time; the heap; invariants."""
 
 import heapq
 
@@ -166,7 +166,9 @@ def test_the_degree_of_a_merged_region_is_the_higher_of_the_two():
     assert rule.degree[root].tolist() == [2, 2]
 
 
-entries = st.lists(st.tuples(st.sampled_from([0.0, 0.5, 1.0, 2.5]), st.integers(0, 50)), min_size=1, max_size=40)
+entries = st.lists(
+    st.tuples(st.sampled_from([0.0, 0.5, 1.0, 2.5]), st.integers(0, 50)), min_size=1, max_size=40
+)
 
 
 @given(entries)
@@ -179,7 +181,9 @@ def test_the_heap_gives_back_its_entries_in_order(items):
     heapq.heapify(wanted)
     for size in range(n - 1, -1, -1):
         got.append((heap.value[0], heap.pair[0]))
-        grouping._sift_down(heap, 0, size, heap.value[size], heap.pair[size], heap.edge[size], heap.version[size])
+        grouping._sift_down(
+            heap, 0, size, heap.value[size], heap.pair[size], heap.edge[size], heap.version[size]
+        )
     assert got == [heapq.heappop(wanted) for _ in range(n)]
 
 
@@ -196,5 +200,7 @@ def test_dropping_stale_entries_keeps_the_others_in_order(items, stale):
     got = []
     for left in range(size - 1, -1, -1):
         got.append((heap.value[0], heap.pair[0]))
-        grouping._sift_down(heap, 0, left, heap.value[left], heap.pair[left], heap.edge[left], heap.version[left])
+        grouping._sift_down(
+            heap, 0, left, heap.value[left], heap.pair[left], heap.edge[left], heap.version[left]
+        )
     assert got == wanted

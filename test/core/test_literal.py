@@ -1,4 +1,4 @@
-"""The paper's literal form end to end on the paper's own scenes, and what the departures from it are worth."""
+"""The paper's literal form end to end on the paper's own scenes, and what departing from it is worth."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,9 @@ def correct(scene, config):
     return counts["correct"] / counts["truth_regions"], result
 
 
-@pytest.mark.parametrize(("family", "least"), [("painting", 0.6), ("billiard", 0.3), ("blocks", 0.4), ("room", 0.3)])
+@pytest.mark.parametrize(
+    ("family", "least"), [("painting", 0.6), ("billiard", 0.3), ("blocks", 0.4), ("room", 0.3)]
+)
 def test_the_literal_form_covers_the_scene_and_finds_regions(family, least):
     scene = make_scene(family, 101, **SIZE)
     share, result = correct(scene, LITERAL)
@@ -53,7 +55,8 @@ def test_the_default_does_not_do_worse_than_the_paper(family):
 
 
 @pytest.mark.parametrize(
-    "back", ["seeds.fit", "grouping.criterion", "generalization.hypothesis", "generalization.test", "grouping.order"]
+    "back",
+    ["seeds.fit", "grouping.criterion", "generalization.hypothesis", "generalization.test", "grouping.order"],
 )
 def test_each_switch_of_the_literal_form_stands_alone(back):
     """The literal form with one departure taken runs as well: the switches are independent."""

@@ -28,7 +28,7 @@ def fitted(n_range=1, degrees=((1, 1), (2, 1), (3, 2), (4, 2))):
 
 @pytest.mark.parametrize("n_range", [1, 3])
 def test_prediction_and_rendering_are_the_sums_of_their_terms(n_range):
-    signals, labels, degree, models = fitted(n_range)
+    _, labels, degree, models = fitted(n_range)
     image = render(models, labels, n_range + 3, n_range)
     assert not image[labels == 0].any()
     for row, col in [(3, 4), (10, 30), (20, 2), (29, 35), (15, 18)]:

@@ -1,4 +1,4 @@
-"""Moments against direct sums over pixels: they add, shift and solve like the pixels themselves (eq. 12-14)."""
+"""Moments against direct sums: they add, shift and solve like the pixels themselves (eq. 12-14)."""
 
 import numpy as np
 import pytest
@@ -102,7 +102,9 @@ def test_a_shift_is_the_sum_about_another_origin_and_can_be_undone(dx, dy, seed)
     x, y, weight = rng.uniform(-1, 1, (3, 40))
     size = 5
     direct = np.array([[(weight * x**a * y**b).sum() for b in range(size)] for a in range(size)])
-    moved = np.array([[(weight * (x + dx) ** a * (y + dy) ** b).sum() for b in range(size)] for a in range(size)])
+    moved = np.array(
+        [[(weight * (x + dx) ** a * (y + dy) ** b).sum() for b in range(size)] for a in range(size)]
+    )
     out, back, work = np.empty((3, size, size))
     shift_grid(direct, dx, dy, out, work)
     reach = np.outer((1 + abs(dx)) ** np.arange(size), (1 + abs(dy)) ** np.arange(size)) * 40
@@ -138,7 +140,9 @@ def test_residual_of_any_model_is_equation_14(degree):
         x, y, values = pixels(image, flags, labels, moments.center[k], k)
         wanted = ((values - naive_patch.monomials(x, y, exponents) @ coef.T) ** 2).sum(axis=0)
         for first, last in ((0, 3), (0, 1), (1, 3)):
-            got = residual(moments.power[k], moments.cross[k], moments.energy[k], first, last, exponents, coef)
+            got = residual(
+                moments.power[k], moments.cross[k], moments.energy[k], first, last, exponents, coef
+            )
             assert got == pytest.approx(wanted[first:last].sum(), rel=1e-10)
 
 

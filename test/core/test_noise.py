@@ -119,7 +119,7 @@ def test_an_exact_frame_has_the_floor_and_not_zero():
 
 
 def test_correlated_noise_is_detected():
-    """Blurred by a Gaussian of 1.5 px, 4 pi 1.5^2 = 28 pixels carry one number; 5x5 blocks can tell up to 25."""
+    """Blurred by a Gaussian of 1.5 px, 4 pi 1.5^2 = 28 pixels carry one number; 5x5 blocks tell up to 25."""
     correlated = cv2.GaussianBlur(white(), (0, 0), 1.5)
     correlated *= SIGMA / correlated.std()
     noise = estimated(room() + correlated)

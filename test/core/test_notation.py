@@ -1,4 +1,4 @@
-"""docs/notation.md cannot go stale: every function, parameter and test that it names exists, every equation is there."""
+"""docs/notation.md cannot go stale: what it names exists, and every equation is there."""
 
 import ast
 import importlib

@@ -71,7 +71,11 @@ def test_the_joint_plane_is_that_of_all_pixels():
     shape, signal, _ = compared(planes, 1, 2)
     assert shape[0] == label.size
     np.testing.assert_allclose(shape[1:3], [x.mean(), y.mean()])
-    spread = [((x - x.mean()) ** 2).sum(), ((x - x.mean()) * (y - y.mean())).sum(), ((y - y.mean()) ** 2).sum()]
+    spread = [
+        ((x - x.mean()) ** 2).sum(),
+        ((x - x.mean()) * (y - y.mean())).sum(),
+        ((y - y.mean()) ** 2).sum(),
+    ]
     np.testing.assert_allclose(shape[3:], spread)
     table = naive_patch.monomials(x - x.mean(), y - y.mean(), PLANE)
     fits = np.linalg.lstsq(table, values, rcond=None)[0]

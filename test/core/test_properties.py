@@ -1,4 +1,4 @@
-"""Symmetries of segment(): what may not change the result, and how little changes where raster order breaks ties."""
+"""Symmetries of segment(): what may not change the result, and how little raster order does."""
 
 import numpy as np
 import pytest
@@ -64,7 +64,7 @@ def test_the_order_of_colour_channels_does_not_matter(scene, labels, order):
 
 @pytest.mark.parametrize("factor", [0.5, 2.0, 16.0])
 def test_the_unit_of_length_does_not_matter(scene, labels, factor):
-    """All tolerances are shares of depth or of the extent, all noise is measured: powers of two change no bit."""
+    """Tolerances are shares of depth or of the extent, noise is measured: powers of two change no bit."""
     frame = scene.frame
     assert rand(labels, segmented(frame.points * np.float32(factor), frame.color, frame.camera)) > 0.9999
 
@@ -93,4 +93,6 @@ def test_noise_of_another_seed_gives_about_the_same_regions():
 def test_surfaces_do_not_depend_on_the_tolerance_of_colours(scene, levels):
     config = SegmenterConfig().replace({"grouping.order": "range_only"})
     wanted = segment(scene.frame, config).labels
-    assert np.array_equal(segment(scene.frame, config.replace({"grouping.color_tolerance": levels})).labels, wanted)
+    assert np.array_equal(
+        segment(scene.frame, config.replace({"grouping.color_tolerance": levels})).labels, wanted
+    )

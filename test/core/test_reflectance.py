@@ -30,7 +30,7 @@ def plane(normal=(0.35, -0.25, -0.9), offset=-1.6):
 
 
 def shaded(depth, normals, albedo, power=1.0):
-    """Eq. (4) for light at the sensor: albedo (mu.n)/r^2, in levels; mu points from the surface to the sensor."""
+    """Eq. (4) for light at the sensor: albedo (mu.n)/r^2, in levels; mu points to the sensor."""
     points = CAMERA.rays(*SHAPE).astype(float) * depth[..., None]
     r = np.linalg.norm(points, axis=-1)
     cosine = -np.einsum("ijk,ijk->ij", normals, points) / r
@@ -105,7 +105,9 @@ def test_pixels_without_geometry_keep_their_place_among_their_neighbours():
     holed = RangeColorFrame(points, frame.color, CAMERA)
     got = normalize_reflectance(holed, ReflectanceConfig(mode="active")).astype(int)
     known = np.median(got[30:40, 50:70])
-    np.testing.assert_allclose(got[40:60, 50:70], known, rtol=0.3)  # the frame's median correction, not the local one
+    np.testing.assert_allclose(
+        got[40:60, 50:70], known, rtol=0.3
+    )  # the frame's median correction, not the local one
     white, _, _ = shaded(depth, normals, np.full(3, 200.0))
     got = normalize_reflectance(holed, ReflectanceConfig(mode="calibrated"), white).astype(int)
     np.testing.assert_allclose(got[40:60, 50:70], np.median(got[30:40, 50:70]), rtol=0.3)

@@ -1,4 +1,4 @@
-"""Initial partition: least median of squares against every minimal subset, and where windows may lie (section 5)."""
+"""Initial partition: least median of squares against every minimal subset, where windows lie (section 5)."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,9 @@ def window(seed, size=7, outliers=0.4, noise=1.0, far=60.0):
     values = np.stack([np.ones_like(x), x, y], 1) @ coef + noise * rng.normal(size=(x.size, CHANNELS))
     bad = np.zeros(x.size, bool)
     bad[rng.choice(x.size, int(outliers * x.size), replace=False)] = True
-    values[bad] += far * rng.choice([-1, 1], (bad.sum(), CHANNELS)) * rng.uniform(0.5, 1.5, (bad.sum(), CHANNELS))
+    values[bad] += (
+        far * rng.choice([-1, 1], (bad.sum(), CHANNELS)) * rng.uniform(0.5, 1.5, (bad.sum(), CHANNELS))
+    )
     return np.column_stack([x, y, values]), bad, coef
 
 

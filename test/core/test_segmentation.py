@@ -1,4 +1,6 @@
-"""The result: levels of the merge tree, reconstruction, and numbers that do not depend on how they are asked for."""
+"""The result: levels of the merge tree, reconstruction, and answers that stay the same."""
+
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -25,7 +27,7 @@ def test_each_level_up_only_joins(family, name):
     scene = make_scene(family, 104, width=128, height=96)
     result = segment(scene.frame, CONFIGS[name])
     cuts = [result.labels_at(level) for level in LEVELS]
-    for fine, coarse in zip(cuts, cuts[1:]):
+    for fine, coarse in pairwise(cuts):
         check_labels(fine, result.labels.shape)
         assert joins_only(fine, coarse)
         assert fine.max() >= coarse.max()

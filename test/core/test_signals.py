@@ -71,7 +71,9 @@ def test_law_and_tolerances_are_in_sigmas_of_the_local_depth():
         assert np.sqrt(var) * signals.scale[0] == pytest.approx(0.005 * w**2, rel=1e-6)
         assert np.sqrt(eps2) * signals.scale[0] == pytest.approx(tolerance * w, rel=1e-6)
     assert signals.color_eps2 == pytest.approx((levels / 4.0) ** 2)
-    slope = (signals.slope[0] + signals.slope[1] * (0.5 - signals.offset[0]) / signals.scale[0]) * signals.scale[0]
+    slope = (
+        signals.slope[0] + signals.slope[1] * (0.5 - signals.offset[0]) / signals.scale[0]
+    ) * signals.scale[0]
     assert slope == pytest.approx(0.5 * UNIT_PX / 70.0)
 
 
@@ -111,7 +113,7 @@ def test_parts_of_the_signals_keep_their_own_flags():
 
 def test_inverse_depth_needs_a_camera_and_xyz_can_be_asked_for():
     made, _, _ = frame("scanner")
-    with pytest.raises(ConfigError, match="signal.kind = inverse_depth needs a camera"):
+    with pytest.raises(ConfigError, match=r"signal\.kind = inverse_depth needs a camera"):
         built(made, **{"signal.kind": "inverse_depth"})
     assert built(made).n_range == 3
     with_camera, _, _ = frame("camera")

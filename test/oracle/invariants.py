@@ -146,7 +146,11 @@ def check_reconstruction(result, points, color):
             depth = 1.0 / value[seen, 0]
             camera = result.camera
             direct = np.stack(
-                [(cols[seen] - camera.cx) / camera.fx * depth, (rows[seen] - camera.cy) / camera.fy * depth, depth],
+                [
+                    (cols[seen] - camera.cx) / camera.fx * depth,
+                    (rows[seen] - camera.cy) / camera.fy * depth,
+                    depth,
+                ],
                 1,
             )
             assert np.allclose(made[seen], direct, rtol=2e-3, atol=0)

@@ -11,8 +11,8 @@ from .naive_patch import rise
 def spread(labels, edges, rounds):
     """Labels grown by breadth-first steps over 0 pixels, and the edge bits met on the way.
 
-    A free pixel is taken by the region that reaches it first; regions of one step come in the order in which their
-    own pixels were reached (raster order to begin with), and each looks up, down, left, right.
+    A free pixel is taken by the region that reaches it first; within a step pixels come in the order in which
+    they were reached (raster order to begin with), and each looks up, down, left, right.
     """
     height, width = len(labels), len(labels[0])
     cells = [list(map(int, line)) for line in labels]
@@ -50,10 +50,10 @@ def pairs(labels, edges, max_gap):
 
 
 def plane_ratio(x, y, values, one, other, n_range, allowances, budgets, whole=False):
-    """Largest of (rise of the residual) / (allowance + n budget) over sides and modalities, planes fitted to pixels.
+    """Largest of (rise of the residual) / (allowance + n budget) over sides and modalities, from pixels.
 
-    one, other : (n,) bool masks; allowances : what noise costs, by modality; budgets : allowed square error of a
-    pixel, by modality (2 tuples each). whole : both sides together, as Chow's test does.
+    one, other : (n,) bool masks; allowances : what noise costs; budgets : allowed square error of a pixel;
+    both by modality. whole : both sides together, as Chow's test does.
     """
     exponents = [(0, 0), (1, 0), (0, 1)]
     joint = one | other

@@ -18,9 +18,9 @@ def predict(coefficients, x, y):
 
 
 def grow(labels, free, within, cost, max_cost, buckets):
-    """Unassigned pixels join the neighbour that costs least, the cheapest offer first (in steps of max_cost/buckets).
+    """Unassigned pixels join the neighbour that costs least, the cheapest offer first (costs in buckets).
 
-    labels : dict-like [row][col]; free(row, col): may be absorbed; cost(label, row, col). Equal offers: first come.
+    free(row, col): may be absorbed; cost(label, row, col). Of equal offers the first is taken.
     """
     height, width = len(labels), len(labels[0])
     out = [list(map(int, line)) for line in labels]

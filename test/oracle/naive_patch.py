@@ -1,6 +1,6 @@
 """Bezier patches, least squares and their errors by direct sums over pixels (eq. 8-15, 18-21).
 
-Slow and plain on purpose; imports nothing of the product. Domains are boxes (row_min, col_min, row_max, col_max).
+Slow and plain on purpose; imports nothing of the product. Boxes are (row_min, col_min, row_max, col_max).
 """
 
 import math
