@@ -1,8 +1,8 @@
 """The two signals of section 2, whitened: one (H, W, C) image in which every residual counts in sigmas.
 
-Range first (inverse depth, or x, y, z), colour after. Division by the noise once, here, is Sigma^-1 of eq. (3):
-all later sums of squares are chi-squared. The range noise may depend on the signal, and the tolerance is a share
-of depth, so both stay a small law of the (whitened) signal, evaluated once a region.
+Range first (inverse depth, or x, y, z), colour after. Division by the noise once, here, is Sigma^-1 of eq.
+(3): all later sums of squares are chi-squared. The range noise may depend on the signal, and the tolerance is
+a share of depth, so both stay a small law of the (whitened) signal, evaluated once a region.
 """
 
 from __future__ import annotations
@@ -24,6 +24,8 @@ from rcseg_core.noise import NoiseModel, estimate_noise
 INVALID, RANGE_OUTLIER, COLOR_OUTLIER = 1, 2, 4
 #: Has the label of a neighbour although no model predicts it: counts for no fit.
 MISFIT = 8
+#: Neighbours of eight, like the pixel itself, that make it part of a line instead of an impulse.
+COMPANY = 3
 #: Half of the window of the local median.
 RIM_PX = 2
 
@@ -36,7 +38,8 @@ class Signals:
     ----------
     image : (H, W, C) float32, C = Cr + 3; channel c is (signal - offset[c]) / scale[c]; 0 where invalid
     cleaned : (H, W, C) float32, image with invalid pixels and impulses replaced by the local median
-    flags : (H, W) uint8 bit mask: 1 invalid, 2 range impulse, 4 colour impulse, 8 misfit (set while segmenting)
+    flags : (H, W) uint8 bit mask: 1 invalid, 2 range impulse, 4 colour impulse, 8 misfit (set while
+    segmenting)
     n_range : Cr, 1 for inverse depth, 3 for x, y, z
     scale, offset : (C,) float64
     law : (6,) float64, `local_scales` reads it: variance of the whitened range noise and squared tolerances
@@ -177,12 +180,27 @@ def _on_rim_slope(raw, median, row, col, scale, limit):  # type: ignore[no-untyp
 
 
 @bare
+def _in_company(color, row, col, scale, n_range, limit):  # type: ignore[no-untyped-def]
+    """Whether enough neighbours share the colour of a pixel: a line of two pixels is no impulse, nor its corner."""
+    height, width, channels = color.shape
+    alike = 0
+    for r in range(max(row - 1, 0), min(row + 2, height)):
+        for c in range(max(col - 1, 0), min(col + 2, width)):
+            far = 0.0
+            for k in range(channels):
+                d = (np.float64(color[r, c, k]) - np.float64(color[row, col, k])) / scale[n_range + k]
+                far = max(far, d * d)
+            alike += far <= limit
+    return alike > COMPANY
+
+
+@bare
 def whiten(raw, median_r, color, median_c, valid, scale, offset, law, threshold, image, cleaned, flags):  # type: ignore[no-untyped-def]
     """Whiten a frame into `image`, flag impulses, and put the local median in their place in `cleaned`.
 
-    raw, median_r : (H, W, Cr) float32; color, median_c : (H, W, 3) uint8; valid : (H, W) bool; scale, offset :
-    (C,) float64; threshold : sigmas from the local median that make an impulse, 0 for none.
-    Out: image, cleaned (H, W, C) float32, flags (H, W) uint8.
+    raw, median_r : (H, W, Cr) float32; color, median_c : (H, W, 3) uint8; valid : (H, W) bool; scale, offset
+    : (C,) float64; threshold : sigmas from the local median that make an impulse, 0 for none. Out: image,
+    cleaned (H, W, C) float32, flags (H, W) uint8.
     """
     height, width, n_range = raw.shape
     limit = threshold * threshold
@@ -216,7 +234,7 @@ def whiten(raw, median_r, color, median_c, valid, scale, offset, law, threshold,
                 value = (color[row, col, c] - offset[n_range + c]) / scale[n_range + c]
                 image[row, col, n_range + c] = value
                 far = max(far, (value - center) * (value - center))
-            if threshold > 0.0 and far > limit:
+            if threshold > 0.0 and far > limit and not _in_company(color, row, col, scale, n_range, limit):
                 flag |= COLOR_OUTLIER
             else:
                 for c in range(n_range, n_range + 3):
