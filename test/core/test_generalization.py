@@ -60,17 +60,19 @@ def test_f_test_is_equations_22_and_23():
 
 
 def test_f_test_of_pure_noise_is_wrong_as_often_as_it_says():
-    """Under the null hypothesis P is uniform on [0, 1]: 400 noise regions."""
+    """Under the null hypothesis P is uniform on [0, 1]: 400 noise regions, one channel and three."""
     table = np.zeros((401, 2, 4))
     rng = np.random.default_rng(5)
-    image = rng.normal(size=(20 * 8, 20 * 50, 2)).astype(np.float32)
+    image = rng.normal(size=(20 * 8, 20 * 50, 4)).astype(np.float32)
     labels = (np.arange(8)[:, None] * 50 + np.arange(50) + 1).repeat(20, 0).repeat(20, 1).astype(np.int32)
     moments = accumulate(image, np.zeros(labels.shape, np.uint8), labels, 400, 2)
     residual_table(moments, 1, tuple(tensor_exponents(k) for k in range(3)), table)
-    p = f_test(table[1:, 0, 0], table[1:, 0, 1], moments.count[1:], 4, 9, 1)
-    for level in (0.05, 0.1, 0.3, 0.5):
-        share = (p < level).mean()
-        assert abs(share - level) < 3.5 * np.sqrt(level * (1 - level) / 400), (level, share)
+    for modality, channels in ((0, 1), (1, 3)):
+        low, high = table[1:, modality, 0], table[1:, modality, 1]
+        p = f_test(low, high, moments.count[1:], 4, 9, channels)
+        for level in (0.05, 0.1, 0.3, 0.5):
+            share = (p < level).mean()
+            assert abs(share - level) < 3.5 * np.sqrt(level * (1 - level) / 400), (channels, level, share)
 
 
 def test_f_test_guards_its_corners():
