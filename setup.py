@@ -71,6 +71,8 @@ setup(
         ],
         "dev": ["ruff>=0.6", "mypy>=1.10", "import-linter>=2.0", "codespell>=2.2", "pre-commit>=3.5"],
         "view": ["foxglove-sdk>=0.16"],
+        # A peer of `rcseg bench`; it takes Open3D too where that is installed, which is too heavy to ask for.
+        "bench": ["scikit-image>=0.22"],
         "ros": ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"],
         # What `colcon build` needs of a ROS installation, as wheels: only to test that build.
         "colcon": [

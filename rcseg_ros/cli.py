@@ -204,6 +204,59 @@ def evaluate(
     )
 
 
+@app.command(epilog="Examples: `rcseg bench -o bench` or `rcseg bench --frames FOLDER --threads all`")
+def bench(
+    frames: Annotated[
+        Optional[list[str]],  # noqa: UP045
+        typer.Option(
+            metavar="SOURCE",
+            help="`synthetic` (the default), a frame or a folder of frames; may be given several times.",
+        ),
+    ] = None,
+    families: Annotated[str, typer.Option(help="Synthetic families, separated by commas.")] = (
+        "room,blocks,curved"
+    ),
+    sizes: Annotated[str, typer.Option(metavar="WIDTHxHEIGHT,...", help="Of synthetic frames.")] = (
+        "160x120,320x240,640x480,1280x960"
+    ),
+    seeds: Annotated[str, typer.Option(help="Of synthetic frames.")] = "100-102",
+    match: Annotated[str, typer.Option(metavar="GLOB", help="Names of the recorded frames.")] = "*",
+    repeat: Annotated[int, typer.Option(min=1, help="Rounds for each frame.")] = 7,
+    threads: Annotated[str, typer.Option(help="1, all, or numbers separated by commas.")] = "1,all",
+    peers: Annotated[bool, typer.Option(help="Run other segmenters too, where installed.")] = True,
+    probe: Annotated[bool, typer.Option(help="Memory and first labels, in fresh processes.")] = True,
+    cold: Annotated[
+        bool, typer.Option("--cold", help="First labels with an empty cache too: a minute or two.")
+    ] = False,
+    output: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option("--output", "-o", help="Folder for bench.json, bench.csv and plots; without it none."),
+    ] = None,
+    config: ConfigFile = None,
+    set_: Settings = None,
+    force: Force = False,
+) -> None:
+    """Measure speed by stage, memory and first labels, beside other segmenters in the same run."""
+    from rcseg_ros.bench import BenchOptions, parse_sizes, parse_threads
+    from rcseg_ros.evaluate import parse_families, parse_seeds
+    from rcseg_ros.settings import load_config
+    from rcseg_ros.terminal import run_bench
+
+    options = BenchOptions(
+        sources=tuple(frames or ("synthetic",)),
+        families=parse_families(families),
+        sizes=parse_sizes(sizes),
+        seeds=parse_seeds(seeds),
+        match=match,
+        repeat=repeat,
+        threads=parse_threads(threads),
+        peers=peers,
+        probe=probe or cold,
+        cold=cold,
+    )
+    run_bench(options, load_config(config, set_ or ()), output, force)
+
+
 @app.command(epilog="Example: `rcseg inspect demo --frame 0`")
 def inspect(
     result: Annotated[Path, typer.Argument(help="Folder that `rcseg replay` wrote.", show_default=False)],

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -15,8 +15,12 @@ from rich.table import Table
 from rcseg_core import Segmentation, SegmenterConfig
 from rcseg_core.config import describe
 from rcseg_core.errors import InputError
+from rcseg_ros.bench import BenchOptions
+from rcseg_ros.bench import run_bench as bench
+from rcseg_ros.bench_report import BENCH, print_bench, write_bench
 from rcseg_ros.replay import ReplayRequest, ReplaySummary, replay
 from rcseg_ros.settings import bounds
+from rcseg_ros.staging import StagedFolder
 from rcseg_ros.view import Viewer, ViewRequest, view
 from rcseg_ros.viewers import FoxgloveViewer, PageViewer
 from rcseg_ros.warmup import warm_up
@@ -69,6 +73,21 @@ def run_view(request: ViewRequest, host: str, port: int, foxglove_port: int | No
         for viewer in viewers:
             viewer.close()
     return 0
+
+
+def run_bench(options: BenchOptions, config: SegmenterConfig, output: Path | None, force: bool) -> None:
+    """Measure, print tables and, with `output`, write files and plots there."""
+    with ExitStack() as stack:
+        stage = stack.enter_context(StagedFolder(output, force, BENCH)) if output is not None else None
+        prepare(config)
+        with _PROGRESS.status("measuring", spinner="line") as status:
+            report = bench(options, config, status.update)
+        print_bench(report, CONSOLE)
+        if stage is not None:
+            stage.path.mkdir()
+            write_bench(report, stage.path)
+            stage.commit()
+            CONSOLE.print(f"figures and plots in {output}", soft_wrap=True)
 
 
 @contextmanager

@@ -1,0 +1,293 @@
+"""`rcseg bench`: milliseconds by stage and by frame, memory, time to the first labels, and peers beside it.
+
+On a machine that does other work too, only ratios within one run mean something. So each round segments a
+frame and then runs every peer on it, and a ratio is the median over the rounds of one time by the other.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import tempfile
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import cv2
+import numba
+import numpy as np
+
+from rcseg_core import RangeColorFrame, SegmenterConfig, segment
+from rcseg_core.datasets import find_frames, load_frame
+from rcseg_core.errors import InputError
+from rcseg_core.synthetic import make_scene
+from rcseg_ros.bench_peers import Peer, installed_peers
+from rcseg_ros.bench_probe import fresh_process
+
+SYNTHETIC, RECORDED = "synthetic", "recorded"
+SEGMENT, FRAME, REGIONS = "segment()", "frame", "regions"
+"""What is timed beside the stages: segment() alone; with the regions described; that description."""
+SLOW_S = 1.0
+"""A peer that takes longer than this runs once for each frame and not in every round."""
+ALL = os.cpu_count() or 1
+
+
+@dataclass(frozen=True)
+class BenchOptions:
+    """What is measured.
+
+    Attributes
+    ----------
+    sources : "synthetic", and paths of frames or of folders of frames
+    families, sizes, seeds : of the synthetic scenes; sizes as (width, height)
+    match : glob on the names of recorded frames, which keep their size
+    repeat : rounds for each frame, after one that does not count
+    threads : numbers of threads, one after another
+    peers : run other segmenters too
+    probe : measure memory and the first labels in fresh processes, one for each group
+    cold : probe with an empty cache of compiled kernels too, once
+    """
+
+    sources: tuple[str, ...] = (SYNTHETIC,)
+    families: tuple[str, ...] = ("room", "blocks", "curved")
+    sizes: tuple[tuple[int, int], ...] = ((160, 120), (320, 240), (640, 480), (1280, 960))
+    seeds: tuple[int, ...] = (100, 101, 102)
+    match: str = "*"
+    repeat: int = 7
+    threads: tuple[int, ...] = tuple(sorted({1, ALL}))
+    peers: bool = True
+    probe: bool = True
+    cold: bool = False
+
+
+@dataclass
+class Group:
+    """The frames of one family and size: their times with one number of threads, by what was timed."""
+
+    name: str
+    width: int
+    height: int
+    threads: int
+    frames: int = 0
+    milliseconds: dict[str, list[float]] = field(default_factory=dict)
+    ratios: dict[str, list[float]] = field(default_factory=dict)
+    stages: tuple[str, ...] = ()
+    probe: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def pixels(self) -> int:
+        return self.width * self.height
+
+    def median(self, what: str) -> float:
+        return float(np.median(self.milliseconds[what]))
+
+    def ratio(self, peer: str) -> float:
+        """segment() over the peer: the median over the rounds; NaN where the peer did not run."""
+        return float(np.median(self.ratios[peer])) if peer in self.ratios else float("nan")
+
+    @property
+    def peers(self) -> tuple[str, ...]:
+        return tuple(self.ratios)
+
+    def rows(self) -> list[dict[str, Any]]:
+        """One row for each thing that was timed."""
+        kinds = {SEGMENT: "whole", FRAME: "whole", **dict.fromkeys(self.peers, "peer")}
+        return [
+            {
+                "group": self.name,
+                "width": self.width,
+                "height": self.height,
+                "threads": self.threads,
+                "frames": self.frames,
+                "kind": kinds.get(what, "stage"),
+                "what": what,
+                "runs": len(times),
+                "median_ms": float(np.median(times)),
+                "p95_ms": float(np.percentile(times, 95)),
+                "ratio": self.ratio(what),
+            }
+            for what, times in self.milliseconds.items()
+        ]
+
+
+@dataclass
+class BenchReport:
+    """What a run found."""
+
+    options: BenchOptions
+    config: SegmenterConfig
+    machine: dict[str, Any]
+    groups: list[Group] = field(default_factory=list)
+    cold: dict[str, float] = field(default_factory=dict)
+    differing: list[str] = field(default_factory=list)
+    """Frames whose labels depend on the number of threads."""
+
+    def growth(self, threads: int) -> dict[str, float]:
+        """By family: time over pixels, largest size against 320x240; 1 grows as the pixels do."""
+        found = {}
+        for name in dict.fromkeys(g.name for g in self.groups):
+            mine = [g for g in self.groups if g.name == name and g.threads == threads and g.width >= 320]
+            if len(mine) > 1:
+                small, large = (f(mine, key=lambda g: g.pixels) for f in (min, max))
+                if small.pixels < large.pixels:
+                    times = large.median(SEGMENT) / small.median(SEGMENT)
+                    found[name] = times / (large.pixels / small.pixels)
+        return found
+
+    def document(self) -> dict[str, Any]:
+        """All figures, for JSON."""
+        return {
+            "machine": self.machine,
+            "options": self.options,
+            "config": self.config.to_dict(),
+            "rows": [row for group in self.groups for row in group.rows()],
+            "fresh_processes": [
+                {"group": g.name, "width": g.width, "height": g.height, **g.probe}
+                for g in self.groups
+                if g.probe
+            ],
+            "cold_cache": self.cold,
+            "growth": {str(n): self.growth(n) for n in self.options.threads},
+            "labels_differ_by_threads": self.differing,
+        }
+
+
+def parse_sizes(text: str) -> tuple[tuple[int, int], ...]:
+    """Sizes from `160x120,640x480`; errors as `parse_size`."""
+    from rcseg_ros.evaluate import parse_size
+
+    return tuple(dict.fromkeys(parse_size(part.strip()) for part in text.split(",")))
+
+
+def parse_threads(text: str) -> tuple[int, ...]:
+    """Numbers of threads from `1`, `all` or `1,all`.
+
+    Raises
+    ------
+    InputError
+    """
+    numbers = []
+    for part in (part.strip() for part in text.split(",")):
+        number = ALL if part == "all" else int(part) if part.isdigit() else 0
+        if not 1 <= number <= ALL:
+            raise InputError(f"--threads {text}: expected all, or numbers from 1 to {ALL}, with commas")
+        numbers.append(number)
+    return tuple(dict.fromkeys(numbers))
+
+
+def run_bench(
+    options: BenchOptions, config: SegmenterConfig, on_step: Callable[[str], object] = lambda text: None
+) -> BenchReport:
+    """Measure; `on_step` is told what comes next. The kernels must be compiled already.
+
+    Raises
+    ------
+    InputError
+        For frames that cannot be found or read.
+    """
+    peers = installed_peers() if options.peers else ()
+    report = BenchReport(options, config, describe_machine())
+    groups: dict[tuple[str, int, int, int], Group] = {}
+    try:
+        for source, name, frame in _frames(options):
+            on_step(f"{name} {frame.width}x{frame.height}")
+            checks = set()
+            for threads in options.threads:
+                set_threads(threads)
+                key = (source, frame.width, frame.height, threads)
+                if key not in groups:
+                    groups[key] = Group(*key)
+                    report.groups.append(groups[key])
+                    if options.probe and threads == options.threads[0]:
+                        groups[key].probe = _probe(frame, config)
+                usable = [p for p in peers if threads == ALL or p.one_thread]
+                checks.add(_measure(groups[key], frame, config, options.repeat, usable))
+            if len(checks) > 1:
+                report.differing.append(f"{name} {frame.width}x{frame.height}")
+            if options.cold and not report.cold:
+                on_step("compiling everything in an empty cache: a minute or two")
+                report.cold = _probe(frame, config, cold=True)
+    finally:
+        set_threads(ALL)
+    return report
+
+
+def set_threads(number: int) -> None:
+    """Let the kernels and OpenCV use so many threads."""
+    numba.set_num_threads(min(number, numba.config.NUMBA_NUM_THREADS))
+    cv2.setNumThreads(number)
+
+
+def describe_machine() -> dict[str, Any]:
+    """What figures depend on: processor, cores, other load, versions."""
+    lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
+    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return {
+        "processor": models[0] if models else platform.processor(),
+        "cores": ALL,
+        "load_before": os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan"),
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+        "numba": numba.__version__,
+        "opencv": cv2.__version__,
+    }
+
+
+def _frames(options: BenchOptions) -> Iterator[tuple[str, str, RangeColorFrame]]:
+    """Group, name and frame; synthetic ones family by family, size by size."""
+    for source in options.sources:
+        if source != SYNTHETIC:
+            for name, path in find_frames(source, options.match):
+                yield RECORDED, name, load_frame(path, name=name).frame
+            continue
+        for family in options.families:
+            for width, height in options.sizes:
+                for seed in options.seeds:
+                    scene = make_scene(family, seed, width=width, height=height)
+                    yield family, f"{family}_{seed:03d}", scene.frame
+
+
+def _measure(
+    group: Group, frame: RangeColorFrame, config: SegmenterConfig, repeat: int, peers: Sequence[Peer]
+) -> int:
+    """Rounds of this frame into `group`; a checksum of the labels."""
+    calls = [(peer.name, call) for peer in peers if (call := peer.make(frame)) is not None]
+    segment(frame, config).regions  # noqa: B018  described on first use: the round that does not count
+    slow = {name for name, call in calls if _seconds(call) > SLOW_S}
+    for round_ in range(repeat):
+        start = perf_counter()
+        result = segment(frame, config)
+        middle = perf_counter()
+        result.regions  # noqa: B018
+        end = perf_counter()
+        whole = {SEGMENT: middle - start, FRAME: end - start}
+        stages = {**result.timings, REGIONS: end - middle}
+        others = {name: _seconds(call) for name, call in calls if round_ == 0 or name not in slow}
+        for what, seconds in {**whole, **stages, **others}.items():
+            group.milliseconds.setdefault(what, []).append(1e3 * seconds)
+        for name, seconds in others.items():
+            group.ratios.setdefault(name, []).append(whole[SEGMENT] / seconds)
+    group.stages = tuple(dict.fromkeys([*group.stages, *stages]))
+    group.frames += 1
+    return zlib.crc32(result.labels.tobytes())
+
+
+def _seconds(call: Callable[[], object]) -> float:
+    start = perf_counter()
+    call()
+    return perf_counter() - start
+
+
+def _probe(frame: RangeColorFrame, config: SegmenterConfig, *, cold: bool = False) -> dict[str, float]:
+    with tempfile.TemporaryDirectory() as folder:
+        frame_path, config_path = Path(folder) / "frame.npz", Path(folder) / "config.json"
+        arrays = {"points": frame.points, "color": frame.color}
+        if (camera := frame.camera) is not None:
+            arrays["K"] = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+        np.savez(frame_path, **arrays)
+        config_path.write_text(json.dumps(config.to_dict()), "utf-8")
+        return fresh_process(frame_path, config_path, cold=cold)
