@@ -1,4 +1,4 @@
-"""What a bench leaves: tables on the screen, bench.json, bench.csv, stages.png and pixels.png."""
+"""What a bench leaves: tables on the screen, bench.json, bench.csv, bench.md, stages.png and pixels.png."""
 
 from __future__ import annotations
 
@@ -21,9 +21,10 @@ TABLE_WIDTH = 150
 
 
 def write_bench(report: BenchReport, folder: Path) -> None:
-    """All figures as JSON, the rows as CSV too, and two plots."""
+    """All figures as JSON, the rows as CSV too, a table for a document, and two plots."""
     (folder / BENCH).write_text(json.dumps(plain(report.document()), indent=1) + "\n", "utf-8")
     write_csv(folder / "bench.csv", [row for group in report.groups for row in group.rows()])
+    (folder / "bench.md").write_text(markdown(report), "utf-8")
     plot_stages(folder / "stages.png", near_vga(report.groups))
     plot_pixels(folder / "pixels.png", report.groups)
 
@@ -59,6 +60,34 @@ def print_bench(report: BenchReport, console: Console) -> None:
     if len(report.options.threads) > 1:
         frames = ", ".join(report.differing)
         console.print(f"labels differ by threads: {frames}" if frames else "labels: the same by all threads")
+
+
+def markdown(report: BenchReport) -> str:
+    """The table of whole frames and peers, as docs/performance.md shows it."""
+    peers = list(dict.fromkeys(peer for group in report.groups for peer in group.peers))
+    heads = [
+        "frames",
+        "size",
+        "threads",
+        "n",
+        SEGMENT,
+        "with regions",
+        *peers,
+        "MB added",
+        "start to labels, s",
+    ]
+    lines = [heads, ["---"] * 3 + ["---:"] * (len(heads) - 3)]
+    for group in report.groups:
+        cells = [*_name(group), str(group.frames), _spread(group, SEGMENT), _spread(group, FRAME)]
+        for peer in peers:
+            ran = peer in group.ratios
+            cells.append(f"{group.median(peer):.1f}, x{group.ratio(peer):.2f}" if ran else "")
+        probe = group.probe
+        cells += (
+            [f"{probe['memory_added_mb']:.0f}", f"{probe['start_to_labels_s']:.2f}"] if probe else ["", ""]
+        )
+        lines.append(cells)
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
 def _wholes(report: BenchReport) -> Table:
@@ -153,7 +182,7 @@ def plot_pixels(path: Path, groups: Sequence[Group]) -> None:
     """segment() over pixels, one line a family and number of threads; peers on the first family dotted."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(7, 5), layout="constrained")
+    figure = Figure(figsize=(9, 5), layout="constrained")
     axes = figure.subplots()
     most = max(group.threads for group in groups)
     colors = {name: f"C{i}" for i, name in enumerate(dict.fromkeys(g.name for g in groups))}
@@ -178,5 +207,5 @@ def plot_pixels(path: Path, groups: Sequence[Group]) -> None:
     axes.set_xticks(list(sizes), list(sizes.values()))
     axes.set_xticks([], minor=True)
     axes.grid(alpha=0.3, which="both")
-    axes.legend(fontsize="small")
+    figure.legend(loc="outside right upper", fontsize="small")
     figure.savefig(path, dpi=120)

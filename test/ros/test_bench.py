@@ -54,6 +54,9 @@ def test_a_run_writes_rows_and_plots(folder):
     assert [row["what"] for row in document["rows"]] == [row["what"] for row in rows]
     assert document["config"] == json.loads(json.dumps(SegmenterConfig().to_dict()))
     assert document["machine"]["cores"] >= 1
+    table = (folder / "bench.md").read_text("utf-8").splitlines()
+    assert len(table) == 4 and table[2].startswith("| room | 80x60 | 1 | 1 | ")
+    assert {line.count("|") for line in table} == {9}
     assert cv2.imread(str(folder / "stages.png")).shape[1] > 500
     assert cv2.imread(str(folder / "pixels.png")).shape[1] > 500
 
