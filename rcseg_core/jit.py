@@ -1,24 +1,92 @@
-"""The one Numba decorator of the package: cached, C-like division, no fastmath (NaN marks invalid pixels)."""
+"""The Numba decorators of the package: cached, C-like division, no fastmath (NaN marks invalid pixels).
 
-from typing import Any, Callable, TypeVar
+Numba renews a cached kernel when its own file changes, but not when a kernel that it calls, in another file, does: after
+an update the old code would run on. So the cache lies in a folder named after a digest of all sources.
+"""
+
+import hashlib
+import os
+import shutil
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
 
 import numba
 
 F = TypeVar("F", bound=Callable[..., Any])
 
+#: Numba's private switch for its counting runtime, as an option of njit.
+UNCOUNTED = {"_nrt": False}
+
 
 def kernel(function: F) -> F:
     """Compile `function` once and keep the result on disk; arrays in, arrays out, no Python objects."""
-    compiled: F = numba.njit(cache=True, error_model="numpy", nogil=True)(function)
-    return compiled
+    return compiled(function)
 
 
 def bare(function: F) -> F:
     """Like `kernel` for code that allocates nothing, without reference counts.
 
-    Numba counts a reference, atomically, for every array that is taken out of a structure; on the small bodies of
-    the grouping loop that is most of the time. Without the counting runtime such a function must get all of its
-    arrays from its caller.
+    Numba counts a reference, atomically, for every array that is taken out of a structure; on the small
+    bodies of the grouping loop that is most of the time. Without the counting runtime such a function must
+    get all of its arrays from its caller. The switch is private to Numba (all releases from 0.59 on have it):
+    where it is gone, this is `kernel`, slower with the same results.
     """
-    compiled: F = numba.njit(cache=True, error_model="numpy", nogil=True, _nrt=False)(function)
-    return compiled
+    return compiled(function, **(UNCOUNTED if HAS_SWITCH else {}))
+
+
+def compiled(function: F, **options: Any) -> F:
+    """`function` compiled with the options that all kernels share, and more."""
+    before = numba.config.CACHE_DIR
+    numba.config.CACHE_DIR = CACHE_FOLDER
+    try:
+        made: F = numba.njit(cache=True, error_model="numpy", nogil=True, **options)(function)
+    finally:
+        numba.config.CACHE_DIR = before
+    return made
+
+
+def cache_folder() -> str:
+    """Where the compiled kernels of exactly these sources are kept.
+
+    In NUMBA_CACHE_DIR if that is set, else beside the package, else (read-only installation) in the user's cache
+    folder, else in a temporary one. Folders of earlier sources beside the package are removed.
+    """
+    package = Path(__file__).resolve().parent
+    digest = hashlib.sha256()
+    for source in sorted(package.glob("*.py")):
+        digest.update(source.read_bytes())
+    name = f"kernels-{digest.hexdigest()[:16]}"
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()) / "rcseg"
+    named = os.environ.get("NUMBA_CACHE_DIR")
+    for parent in [Path(named)] if named else [package / "__pycache__", home]:
+        try:
+            folder = parent / name
+            folder.mkdir(parents=True, exist_ok=True)
+            if os.access(folder, os.W_OK):
+                if parent == package / "__pycache__":
+                    for old in set(parent.glob("kernels-*")) - {folder}:
+                        shutil.rmtree(old, ignore_errors=True)
+                return str(folder)
+        except (OSError, RuntimeError):
+            continue
+    return tempfile.mkdtemp(prefix="rcseg-kernels-")
+
+
+CACHE_FOLDER = cache_folder()
+
+
+def knows(options: dict[str, Any]) -> bool:
+    """Whether this Numba takes these options; njit itself would only complain at the first call."""
+    try:
+        from numba.core.compiler import Flags
+        from numba.core.registry import cpu_target
+
+        cpu_target.options.parse_as_flags(Flags(), options)
+    except (ImportError, AttributeError, KeyError, TypeError):
+        return False
+    return True
+
+
+HAS_SWITCH = knows(UNCOUNTED)
