@@ -1,10 +1,9 @@
 """Single pixels: absorbed by the region that predicts them, moved where a neighbour predicts them better.
 
-The paper groups regions "with other regions or points" (step 3): a point is a region of one pixel, so it can be
-absorbed and never absorbs. Growth is best-first over the whole image (a bucket queue over the cost), which makes
-regions meet where their models cross. `refine` then lets boundary pixels change sides, and `fill` gives the
-remaining specks to a neighbour. A pixel takes over the leaf (seed) of the pixel it joined, so that the merge tree
-stays a tree of pixels.
+The paper groups regions "with other regions or points" (step 3): a point is a region of one pixel, so it can
+be absorbed and never absorbs. Growth is best-first over the whole image (a bucket queue over the cost), which
+makes regions meet where their models cross. `refine` then lets boundary pixels change sides. A pixel takes
+over the leaf (seed) of the pixel it joined, so that the merge tree stays a tree of pixels.
 """
 
 from __future__ import annotations
@@ -68,7 +67,7 @@ def _bucket(models, k, image, flags, row, col, n_range, law, color_eps2, max_cos
 
 @bare
 def _grow(image, flags, labels, leaves, within, models, n_range, law, color_eps2, max_cost, offers):  # type: ignore[no-untyped-def]
-    """Best-first growth: unassigned pixels get an offer from each region they touch; the cheapest is taken first.
+    """Best-first growth: unassigned pixels get an offer of each region they touch; the cheapest comes first.
 
     Returns the number of pixels that were absorbed.
     """
@@ -86,7 +85,8 @@ def _grow(image, flags, labels, leaves, within, models, n_range, law, color_eps2
                     continue
                 if labels[r, c] == 0 or within[r, c] != within[row, col]:
                     continue
-                bucket = _bucket(models, labels[r, c], image, flags, row, col, n_range, law, color_eps2, max_cost)
+                k = labels[r, c]
+                bucket = _bucket(models, k, image, flags, row, col, n_range, law, color_eps2, max_cost)
                 if bucket >= 0:
                     _offer(offers, used, bucket, row * width + col, r * width + c)
                     used += 1
@@ -123,7 +123,7 @@ def _grow(image, flags, labels, leaves, within, models, n_range, law, color_eps2
 
 @bare
 def _refine(image, flags, labels, leaves, models, n_range, law, color_eps2, smoothness):  # type: ignore[no-untyped-def]
-    """One raster pass: each boundary pixel takes the label with the least cost plus smoothness per other neighbour.
+    """One raster pass: each boundary pixel takes the label of least cost, smoothness included.
 
     Returns the number of pixels that changed.
     """
@@ -160,7 +160,9 @@ def _refine(image, flags, labels, leaves, models, n_range, law, color_eps2, smoo
                     for j in range(-1, 2):
                         rr = row + i
                         cc = col + j
-                        if 0 <= rr < height and 0 <= cc < width and labels[rr, cc] > 0 and labels[rr, cc] != m:
+                        if rr < 0 or cc < 0 or rr >= height or cc >= width:
+                            continue
+                        if labels[rr, cc] > 0 and labels[rr, cc] != m:
                             cost += smoothness
                 if cost < best_cost or (cost == best_cost and m < best):
                     best_cost = cost
@@ -201,7 +203,7 @@ SMOOTHNESS = 0.5
 def refine(
     signals: Signals, labels: NDArray[np.int32], leaves: NDArray[np.int32], models: Models, passes: int
 ) -> int:
-    """Let boundary pixels move to the adjacent region that predicts them better, in place; returns how many did."""
+    """Move boundary pixels, in place, to the adjacent region that predicts them better; returns how many."""
     total = 0
     for _ in range(passes):
         moved = _refine(

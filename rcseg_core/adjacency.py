@@ -1,7 +1,7 @@
 """The region adjacency graph: which regions touch, along how many pixels, and how much of that crosses edges.
 
-Regions are first spread over unassigned pixels by half of the allowed gap, so that an edge band or a missing pixel
-does not part neighbours. A spreading pixel remembers which kinds of edge it came across.
+Regions are first spread over unassigned pixels by half of the allowed gap, so that an edge band or a missing
+pixel does not part neighbours. A spreading pixel remembers which kinds of edge it came across.
 """
 
 from __future__ import annotations
@@ -32,7 +32,8 @@ class Pairs(NamedTuple):
         kept = (nodes[:, 0] != nodes[:, 1]) & (nodes[:, 0] > 0)
         size = int(mapping.max()) + 1
         keys, inverse = np.unique(nodes[kept, 0] * size + nodes[kept, 1], return_inverse=True)
-        sums = (np.bincount(inverse, a[kept], minlength=keys.size) for a in self[1:])
+        weights = (self.boundary, self.range_crossed, self.color_crossed)
+        sums = (np.bincount(inverse, a[kept], minlength=keys.size).astype(np.float64) for a in weights)
         return Pairs(np.stack([keys // size, keys % size], 1), *sums)
 
 
@@ -84,8 +85,9 @@ def spread(labels, edges, rounds, cells, met):  # type: ignore[no-untyped-def]
 def touching(cells, met, count, keys, tally):  # type: ignore[no-untyped-def]
     """Count 4-neighbour pixel pairs of different cells by their two labels, in an open-addressed hash table.
 
-    keys : (size,) int64 filled with -1, size a power of two; tally : (size, 3) float64 zeros: pixel pairs, those that
-    met a range edge, those that met a colour edge. Returns the number of entries, or -1 when the table is too full.
+    keys : (size,) int64 filled with -1, size a power of two; tally : (size, 3) float64 zeros: pixel pairs,
+    those that met a range edge, those that met a colour edge. Returns the number of entries, or -1 when the
+    table is too full.
     """
     height, width = cells.shape
     size = keys.shape[0]

@@ -1,7 +1,7 @@
 """Bezier patches (section 4, eq. 8-11): basis, conversion from local monomials, evaluation, elevation.
 
-Domain: the region's own bounding box, u = (col - col_min) / (col_max - col_min) and v likewise in rows, both in
-[0, 1]. Grouping works in centred monomials, where sums add; the conversion here is exact and done once a region.
+Domain: the region's own bounding box, u = (col - col_min) / (col_max - col_min) and v likewise in rows, both
+in [0, 1]. Grouping works in centred monomials, where sums add; the conversion here is exact, once a region.
 """
 
 from __future__ import annotations
@@ -26,26 +26,29 @@ def bernstein(degree: int, t: NDArray[Any]) -> NDArray[np.float64]:
 def basis(degree: int, u: NDArray[Any], v: NDArray[Any]) -> NDArray[np.float64]:
     """M of eq. (11): products B_i(u) B_j(v), shape (*u.shape, (degree + 1)^2), j varying fastest."""
     product = bernstein(degree, u)[..., :, None] * bernstein(degree, v)[..., None, :]
-    return product.reshape(*product.shape[:-2], (degree + 1) ** 2)
+    return np.asarray(product.reshape(*product.shape[:-2], (degree + 1) ** 2))
 
 
 @lru_cache(maxsize=8)
 def power_to_bernstein(degree: int) -> NDArray[np.float64]:
     """(k+1, k+1) matrix that turns coefficients of t^i into Bernstein coefficients."""
     return np.array(
-        [[comb(j, i) / comb(degree, i) if i <= j else 0.0 for i in range(degree + 1)] for j in range(degree + 1)]
+        [
+            [comb(j, i) / comb(degree, i) if i <= j else 0.0 for i in range(degree + 1)]
+            for j in range(degree + 1)
+        ]
     )
 
 
 def monomial_to_bernstein(degree: int, offset: float, span: float) -> NDArray[np.float64]:
-    """(k+1, k+1) matrix from coefficients of x^i to Bernstein coefficients in t, where x = offset + span t."""
+    """(k+1, k+1) matrix from coefficients of x^i to Bernstein coefficients in t, x = offset + span t."""
     powers = np.array(
         [
             [comb(i, m) * offset ** (i - m) * span**m if m <= i else 0.0 for i in range(degree + 1)]
             for m in range(degree + 1)
         ]
     )
-    return power_to_bernstein(degree) @ powers
+    return np.asarray(power_to_bernstein(degree) @ powers)
 
 
 def elevate(control_points: NDArray[Any]) -> NDArray[np.float64]:
@@ -61,7 +64,7 @@ def elevate(control_points: NDArray[Any]) -> NDArray[np.float64]:
 
 
 def subdivide(control_points: NDArray[Any], t0: float, t1: float, axis: int) -> NDArray[np.float64]:
-    """The part of a patch (or its extrapolation) between t0 and t1 of u (axis 0) or v (axis 1), on [0, 1] again."""
+    """The part of a patch from t0 to t1 of u (axis 0) or v (axis 1), also beyond it, on [0, 1] again."""
     k = control_points.shape[-1] - 1
     inverse = np.linalg.inv(power_to_bernstein(k))
     matrix = monomial_to_bernstein(k, t0, t1 - t0) @ inverse
@@ -78,7 +81,7 @@ class BezierPatch:
     ----------
     kind : "inverse_depth" (1 channel, 1/m; point = ray / value), "xyz" (3 channels, m) or "rgb" (3, levels)
     degree : int, tensor degree k in u and in v (eq. 8)
-    control_points : (channels, k+1, k+1) float64; first index of the pair along u (columns), second along v (rows)
+    control_points : (channels, k+1, k+1) float64; first index along u (columns), second along v (rows)
     standard_errors : same shape, root of eq. (15); NaN where the pixels do not determine a coefficient
     covariance : (channels, channels) float64, residual covariance, eq. (14) over the degrees of freedom
     domain : (row_min, col_min, row_max, col_max), inclusive pixels that map to [0, 1]

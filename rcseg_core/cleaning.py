@@ -1,7 +1,7 @@
 """Before anything is measured: fill holes for the filters, and flag impulses instead of calling them edges.
 
-A median of 5x5 survives nearly half of the pixels being wrong, so a pixel far from it is an impulse (or a flying
-pixel): it neither blocks a seed window nor enters a fit. Filled values only feed the filters, never a model.
+A median of 5x5 survives nearly half of the pixels being wrong, so a pixel far from it is an impulse (or a
+flying pixel): it neither blocks a seed window nor enters a fit. Filled values feed the filters only.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ LINEAR_GAP_PX = 8
 
 @kernel
 def fill_rows(image, valid, out):  # type: ignore[no-untyped-def]
-    """Fill invalid pixels of a (H, W) float32 image along rows; rows without any valid pixel copy the row above."""
+    """Fill invalid pixels of a (H, W) float32 image along rows; an empty row copies the row above."""
     height, width = image.shape
     for row in range(height):
         last = -1
@@ -32,7 +32,7 @@ def fill_rows(image, valid, out):  # type: ignore[no-untyped-def]
             gap = col - last - 1
             if gap > 0:
                 if last < 0:
-                    for c in range(0, col):
+                    for c in range(col):
                         out[row, c] = value
                 elif gap <= LINEAR_GAP_PX:
                     left = image[row, last]

@@ -1,23 +1,28 @@
 """Every parameter of the algorithm: one frozen group a stage, one line a parameter.
 
-This file is the only place that holds a default, a unit, a bound or a paper symbol. YAML files, ROS parameters,
-``--set group.name=value`` and the reference in ``rcseg config`` are all derived from it by `describe`.
-Where the default departs from the paper, the literal form is one of the choices (`SegmenterConfig.literal`).
+This file is the only place that holds a default, a unit, a bound or a paper symbol. YAML files, ROS
+parameters, ``--set group.name=value`` and the reference in ``rcseg config`` are all derived from it by
+`describe`. Where the default departs from the paper, the literal form is one of the choices
+(`SegmenterConfig.literal`).
 """
 
 from __future__ import annotations
 
 import dataclasses
 import difflib
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from typing import Any, Literal, Mapping
+from typing import Any, Literal
 
 from rcseg_core.errors import ConfigError
+
+#: What YAML and shells write for a boolean.
+TRUE_WORDS, FALSE_WORDS = ("true", "yes", "on", "1"), ("false", "no", "off", "0")
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """One parameter as users see it: dotted key, value, default, type, unit, bounds or choices, symbol, text."""
+    """One parameter as users see it: key, value, default, type, unit, bounds or choices, symbol, text."""
 
     key: str
     value: Any
@@ -63,7 +68,8 @@ class NoiseConfig:
 
     range_model: Literal["auto", "constant", "kinect_v1", "realsense_d435"] = _param(
         "auto",
-        "auto: estimated from each frame as a function of depth; constant: range_sigma at every depth; else a sensor",
+        "auto: estimated from each frame as a function of depth; constant: range_sigma at every depth; "
+        "else a sensor",
         choices=("auto", "constant", "kinect_v1", "realsense_d435"),
         symbol="Sigma_r",
     )
@@ -86,7 +92,8 @@ class ReflectanceConfig:
 
     mode: Literal["none", "active", "calibrated"] = _param(
         "none",
-        "none: passive light; active: light at the sensor, eq. (5); calibrated: white-reference frame, eq. (6)-(7)",
+        "none: passive light; active: light at the sensor, eq. (5); calibrated: white-reference frame, "
+        "eq. (6)-(7)",
         choices=("none", "active", "calibrated"),
         symbol="rho_lambda",
     )
@@ -98,7 +105,7 @@ class ReflectanceConfig:
 
 @dataclass(frozen=True)
 class EdgesConfig:
-    """Morphological depth, orientation and colour discontinuities (section 8; Boulanger, Blais & Cohen 1990)."""
+    """Morphological depth, orientation and colour discontinuities (section 8; Boulanger et al. 1990)."""
 
     depth_threshold: float = _param(
         10.0, "step of the range signal that is a depth discontinuity, beside depth_step", unit="sigma",
@@ -108,17 +115,19 @@ class EdgesConfig:
         0.02, "least step that is a depth discontinuity", unit="fraction of depth", low=0.0, high=1.0
     )
     orientation_threshold: float = _param(
-        5.0, "morphological Laplacian that is an orientation discontinuity", unit="sigma", low=1.0, high=1000.0
-    )
+        5.0, "morphological Laplacian that is an orientation discontinuity", unit="sigma",
+        low=1.0, high=1000.0,
+    )  # fmt: skip
     orientation_window: int = _param(
         7, "odd window of the morphological Laplacian", unit="px", low=3, high=15
     )
     color_threshold: float = _param(
-        40.0, "morphological gradient of one channel that is a colour edge", unit="levels", low=1.0, high=255.0
-    )
+        40.0, "morphological gradient of one channel that is a colour edge", unit="levels",
+        low=1.0, high=255.0,
+    )  # fmt: skip
     outlier_threshold: float = _param(
-        6.0, "distance from the local median beyond which a pixel is an impulse, not an edge; 0: none are flagged",
-        unit="sigma", low=0.0, high=1000.0,
+        6.0, "distance from the local median beyond which a pixel is an impulse, not an edge; "
+        "0: none are flagged", unit="sigma", low=0.0, high=1000.0,
     )  # fmt: skip
 
 
@@ -133,7 +142,9 @@ class SeedsConfig:
         "lms: every window (the paper); auto: only windows whose least-squares residual is not pure noise",
         choices=("auto", "lms"),
     )
-    subsets: int = _param(72, "random minimal subsets a window; 72 give 99 % at 50 % outliers", low=1, high=2000)
+    subsets: int = _param(
+        72, "random minimal subsets a window; 72 give 99 % at 50 % outliers", low=1, high=2000
+    )
     min_valid: float = _param(
         0.5, "least share of usable pixels in a window", unit="fraction", low=0.1, high=1.0
     )
@@ -145,19 +156,20 @@ class GroupingConfig:
 
     order: Literal["surfaces_first", "joint", "range_only"] = _param(
         "surfaces_first",
-        "surfaces_first: surfaces from range alone, then the colour regions on each; joint: both signals at once "
-        "(the paper); range_only: surfaces, whatever their colour",
+        "surfaces_first: surfaces from range alone, then the colour regions on each; joint: both signals at "
+        "once (the paper); range_only: surfaces, whatever their colour",
         choices=("surfaces_first", "joint", "range_only"),
     )
     criterion: Literal["bounded", "chow", "bayes"] = _param(
         "bounded",
-        "bounded: the joint model must explain both sides; chow: total rise of the residual; bayes: c_ib of eq. (21)",
+        "bounded: the joint model must explain both sides; chow: total rise of the residual; bayes: c_ib of "
+        "eq. (21)",
         choices=("bounded", "chow", "bayes"),
         symbol="c_ib",
     )
     range_tolerance: float = _param(
-        0.004, "approximation limit of the range models", unit="fraction of depth (of extent for scanner grids)",
-        low=0.0, high=0.5, symbol="epsilon_t (range)",
+        0.004, "approximation limit of the range models",
+        unit="fraction of depth (of extent for scanner grids)", low=0.0, high=0.5, symbol="epsilon_t (range)",
     )  # fmt: skip
     color_tolerance: float = _param(
         20.0, "approximation limit of the colour models", unit="levels", low=0.0, high=255.0,
@@ -168,15 +180,16 @@ class GroupingConfig:
         unit="fraction of relief", low=0.0, high=1.0,
     )  # fmt: skip
     noise_share: float = _param(
-        0.4, "systematic part of the noise that more pixels do not average away", unit="sigma", low=0.0, high=10.0
-    )
+        0.4, "systematic part of the noise that more pixels do not average away", unit="sigma",
+        low=0.0, high=10.0,
+    )  # fmt: skip
     edge_gate: bool = _param(
         True, "scale the tolerance by the share of the common boundary that crosses no detected edge"
     )
     max_gap: int = _param(3, "regions at most this far apart are adjacent", unit="px", low=1, high=15)
     prior_beta: float = _param(
-        1.0, "strength of the belief in the coefficients, for criterion bayes", unit="sigma", low=1e-6, high=1e6,
-        symbol="beta",
+        1.0, "strength of the belief in the coefficients, for criterion bayes", unit="sigma",
+        low=1e-6, high=1e6, symbol="beta",
     )  # fmt: skip
 
 
@@ -186,7 +199,8 @@ class GeneralizationConfig:
 
     hypothesis: Literal["pair", "region"] = _param(
         "pair",
-        "pair: a higher degree is tried on the union of two regions; region: on each region alone (the paper)",
+        "pair: a higher degree is tried on the union of two regions; region: on each region alone (the "
+        "paper)",
         choices=("pair", "region"),
     )
     test: Literal["guarded", "f"] = _param(
@@ -230,7 +244,7 @@ class AbsorptionConfig:
 
 @dataclass(frozen=True)
 class SegmenterConfig:
-    """The whole configuration. Frozen; build variants with `replace`, `from_dict` or `dataclasses.replace`."""
+    """The whole configuration. Frozen; variants come from `replace`, `from_dict` or `dataclasses.replace`."""
 
     signal: SignalConfig = SignalConfig()
     noise: NoiseConfig = NoiseConfig()
@@ -317,7 +331,7 @@ def describe(config: SegmenterConfig) -> list[Parameter]:
     out = []
     for group in fields(SegmenterConfig):
         values = getattr(config, group.name)
-        for f in fields(type(group.default)):
+        for f in fields(values):
             out.append(
                 Parameter(
                     key=f"{group.name}.{f.name}",
@@ -331,12 +345,11 @@ def describe(config: SegmenterConfig) -> list[Parameter]:
 
 
 def _convert(parameter: Parameter, value: Any) -> Any:
-    """`value` as the parameter's type; text is parsed, integers may stand for floats, booleans for nothing else."""
+    """`value` as the parameter's type: text is parsed, an integer may stand for a float."""
     kind = parameter.type
     if isinstance(value, str) and kind is bool:
-        words = {"true": True, "yes": True, "on": True, "1": True, "false": False, "no": False, "off": False, "0": False}
-        if value.lower() in words:
-            return words[value.lower()]
+        if value.lower() in TRUE_WORDS + FALSE_WORDS:
+            return value.lower() in TRUE_WORDS
     elif isinstance(value, str) and kind in (int, float):
         try:
             return kind(value)
@@ -366,7 +379,7 @@ def _check(parameter: Parameter) -> None:
     if not bad and parameter.choices:
         bad = value not in parameter.choices
     elif not bad and parameter.type in (int, float):
-        bad = not (parameter.low <= value <= parameter.high)  # type: ignore[operator]  # NaN fails too
+        bad = not (parameter.low <= value <= parameter.high)  # NaN fails too
         bad = bad or (parameter.key.endswith("_window") and value % 2 == 0)
     if bad:
         raise ConfigError(f"{parameter.key} = {value!r}: expected {_expected(parameter)}")

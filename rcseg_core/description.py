@@ -1,7 +1,7 @@
 """From moments to what users read: Bezier patches with standard errors, centroids, normals, neighbours.
 
-Everything is computed for all regions of one degree at once, in the local basis, and converted to the Bernstein
-form on the region's box exactly.
+Everything is computed for all regions of one degree at once, in the local basis, and converted to the
+Bernstein form on the region's box exactly.
 """
 
 from __future__ import annotations
@@ -100,9 +100,15 @@ def build_patches(
                 control_points=control * scale[:, None, None] + offset[:, None, None],
                 standard_errors=(spread * scale)[:, None, None] * unit_error,  # root of eq. (15)
                 covariance=covariance * scale[:, None] * scale[None, :],
-                domain=tuple(int(v) for v in box),
+                domain=_box(box),
             )
     return patches
+
+
+def _box(box: NDArray[np.int64]) -> tuple[int, int, int, int]:
+    """Row of a box array as plain integers."""
+    row_min, col_min, row_max, col_max = box.tolist()
+    return row_min, col_min, row_max, col_max
 
 
 def _to_bernstein(
@@ -166,7 +172,7 @@ def describe_regions(
                 label=k,
                 surface=int(surface_of[k]),
                 pixel_count=int(sizes[k]),
-                box=tuple(int(v) for v in boxes[k]),
+                box=_box(boxes[k]),
                 centroid=middle,
                 normal=_normal(range_patches[k - 1], row, col, frame),
                 neighbors=tuple(sorted(neighbors[k])),

@@ -1,9 +1,9 @@
 """Depth, orientation and colour discontinuities by mathematical morphology (section 8).
 
-Boulanger, Blais & Cohen 1990. The morphological Laplacian |dilation + erosion - 2 s| is zero on any plane of the
-signal, however oblique; it fires on creases, and an order of magnitude more on steps. In a small window it
-tells steps, in a wider one and on a smoothed signal creases, where only its ridge is kept: thick bands would
-kill slivers. Colour edges are the morphological gradient, dilation minus erosion, of the strongest channel.
+Boulanger, Blais & Cohen 1990. The morphological Laplacian |dilation + erosion - 2 s| is zero on any plane of
+the signal, however oblique; it fires on creases, and an order of magnitude more on steps. In a small window
+it tells steps, in a wider one and on a smoothed signal creases, where only its ridge is kept: thick bands
+would kill slivers. Colour edges are the morphological gradient of the strongest channel.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ RANGE_EDGES = np.uint8(DEPTH | ORIENTATION)
 
 #: Box that smooths the range before creases are looked for.
 SMOOTH_PX = 5
-#: How far smoothing lowers white noise in the Laplacian: 0.15 at its 99 % point; at this value, and five sigmas,
-#: fewer than one pixel in a million fires on noise.
+#: How far smoothing lowers white noise in the Laplacian: 0.15 at its 99 % point; at this value, and five
+#: sigmas, fewer than one pixel in a million fires on noise.
 SMOOTH_GAIN = 0.26
 #: A crease pixel is kept where its Laplacian is at least this share of the strongest within RIDGE_PX.
 RIDGE_SHARE, RIDGE_PX = 0.75, 5

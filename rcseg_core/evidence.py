@@ -2,11 +2,12 @@
 
 bounded (default): one joint model must explain BOTH sides: for each side s and each modality
     RSS_s(joint) - RSS_s(own)  <  m (p + 4 sqrt(2 p))  +  n_s (share^2 + eps^2)     (everything in sigma^2)
-The first term is what noise alone costs when m pixels make one independent measurement, the second what the approximation limit eps_t allows; the value is the
-largest ratio of left to right, so 1 is the limit and the measure is symmetric.
+The first term is what noise alone costs when m pixels make one independent measurement, the second what the
+approximation limit eps_t allows; the value is the largest ratio of left to right, so 1 is the limit and the
+measure is symmetric.
 chow: the same for the total rise of both sides at once.
 bayes: c_ib of eq. (21), the larger region predicts the smaller (the other way extrapolation explodes).
-Small regions are also absorbed like points (step 3): where the larger one predicts them within the tolerance.
+points: small regions are absorbed whole (step 3) where the larger one predicts them within the tolerance.
 """
 
 from __future__ import annotations
@@ -19,45 +20,11 @@ from numpy.typing import NDArray
 from rcseg_core.jit import bare
 from rcseg_core.moments import UNIT_PX, Moments, mean_square_gradient, residual, shift_grid, solve
 from rcseg_core.planes import joint_shape, joint_signal, rise
+from rcseg_core.rule import BAYES, CHOW, POINTS, channel_span
 from rcseg_core.signals import local_scales
 
-BOUNDED, CHOW, BAYES, POINTS = 0, 1, 2, 3
 #: Steeper than this (tan^2) a surface is hardly measured: the tolerance along the ray grows no further.
 MAX_TAN2 = 8.0
-KINDS = {"bounded": BOUNDED, "chow": CHOW, "bayes": BAYES}
-
-
-class Rule(NamedTuple):
-    """What a comparison goes by, the same for all pairs of a pass.
-
-    kind : BOUNDED, CHOW, BAYES or POINTS; n_range, channels : int; law, color_eps2 : see Signals;
-    share2 : squared noise share; relief2 : squared relief tolerance;
-    correlation : pixels an independent measurement, of range and of colour;
-    slope : gradient (whitened, per UNIT_PX) of a surface tilted by 45 degrees, as a + b s of the signal; beta2 : beta^2 of eq. (20); use_range, use_color : whether a modality counts;
-    earn : whether a side must earn the tolerance and a new degree (not at levels that users ask for);
-    small : pixels below which a region may be absorbed like a point, for POINTS;
-    terms : exponents of the models by degree, (p, 2) int64 each; terms[1] is a plane or the bilinear form;
-    degree : (N + 1, 2) int64, degree of range and colour of each region; a pair takes the higher of the two (step 6);
-    settled : (N + 1,) int64, range degree that each region had earned before; at or below its degree
-    """
-
-    kind: int
-    n_range: int
-    channels: int
-    law: NDArray[np.float64]
-    color_eps2: float
-    share2: float
-    relief2: float
-    correlation: tuple[float, float]
-    slope: tuple[float, float]
-    beta2: float
-    use_range: bool
-    use_color: bool
-    earn: bool
-    small: float
-    terms: tuple[NDArray[np.int64], ...]
-    degree: NDArray[np.int64]
-    settled: NDArray[np.int64]
 
 
 class Work(NamedTuple):
@@ -102,20 +69,12 @@ def move(moments, k, center_x, center_y, work, power, cross):  # type: ignore[no
 
 
 @bare
-def channel_span(rule, modality):  # type: ignore[no-untyped-def]
-    """First channel and one past the last of a modality: 0 range, 1 colour."""
-    if modality == 0:
-        return 0, rule.n_range
-    return rule.n_range, rule.channels
-
-
-@bare
 def own_residuals(moments, k, rule, work, out):  # type: ignore[no-untyped-def]
     """Residual sums of squares of region k about its own models: out[0] range, out[1] colour.
 
-    out[2]: range about a first-degree model where the own degree is higher, else inf; out[3]: mean of 1/cos^2 of
-    the slope of the surface, by which a distance along the ray exceeds the distance to the surface, squared; out[4]: range about the model
-    of the settled degree.
+    out[2]: range about a first-degree model where the own degree is higher, else inf; out[3]: mean of 1/cos^2
+    of the slope of the surface, by which a distance along the ray exceeds the distance to the surface,
+    squared; out[4]: range about the model of the settled degree.
     """
     for modality in range(2):
         first, last = channel_span(rule, modality)
@@ -126,7 +85,8 @@ def own_residuals(moments, k, rule, work, out):  # type: ignore[no-untyped-def]
         )
         if modality == 0 and rule.use_range and rule.degree[k, 0] > 1:
             steepness = mean_square_gradient(moments.power[k], terms, work.coef[last - 1])
-            flat = rule.slope[0] + rule.slope[1] * moments.cross[k, 0, 0, 0] / max(moments.power[k, 0, 0], 1.0)
+            mean = moments.cross[k, 0, 0, 0] / max(moments.power[k, 0, 0], 1.0)
+            flat = rule.slope[0] + rule.slope[1] * mean
             out[3] = 1.0 + min(steepness / (flat * flat), MAX_TAN2)
     out[2] = np.inf
     if rule.use_range and rule.degree[k, 0] > 1:
@@ -147,10 +107,10 @@ def own_residuals(moments, k, rule, work, out):  # type: ignore[no-untyped-def]
 def earned_tolerance(eps2, relief2, n, own, var):  # type: ignore[no-untyped-def]
     """The tolerance that a side may claim in a higher-degree model, from what its first-degree model misses.
 
-    The tolerance is there for shapes that no polynomial follows. A side that is flat to within the noise needs
-    none: two such sides that only a bent model with tolerance could join are the two faces of a crease. A side
-    with much relief may miss a share of it: a quartic follows a hemisphere to 2 % of its radius, however large.
-    The tolerance is a distance to the surface; own[3] makes it one along the ray.
+    The tolerance is there for shapes that no polynomial follows. A side that is flat to within the noise
+    needs none: two such sides that only a bent model with tolerance could join are the two faces of a crease.
+    A side with much relief may miss a share of it: a quartic follows a hemisphere to 2 % of its radius,
+    however large. The tolerance is a distance to the surface; own[3] makes it one along the ray.
     """
     if own[2] == np.inf:
         return eps2
@@ -215,7 +175,7 @@ def compare_planes(planes, i, j, rule, gate_r, gate_c, shape, signal):  # type: 
 
 @bare
 def _bounded(moments, big, small, rule, own, gate_r, gate_c, work):  # type: ignore[no-untyped-def]
-    """Largest ratio over sides and modalities (or of the totals), and the multiple of the tolerance it needs."""
+    """Largest ratio over sides and modalities (or of the totals), and the multiple of the limit it needs."""
     n_big = moments.power[big, 0, 0]
     n_small = moments.power[small, 0, 0]
     value = 0.0
@@ -235,19 +195,18 @@ def _bounded(moments, big, small, rule, own, gate_r, gate_c, work):  # type: ign
         p = np.float64(terms.shape[0] * (last - first))
         noise = var * rule.correlation[modality] * (p + 4.0 * np.sqrt(2.0 * p))
         share = rule.share2 * var
-        rise_big = (
-            residual(moments.power[big], moments.cross[big], moments.energy[big], first, last, terms, work.coef)
-            - own[big, modality]
+        rise_big = -own[big, modality] + residual(
+            moments.power[big], moments.cross[big], moments.energy[big], first, last, terms, work.coef
         )
-        rise_small = (
-            residual(work.power, work.cross, moments.energy[small], first, last, terms, work.coef)
-            - own[small, modality]
+        rise_small = -own[small, modality] + residual(
+            work.power, work.cross, moments.energy[small], first, last, terms, work.coef
         )
         budget_big = n_big * eps2
         budget_small = n_small * eps2
         if modality == 0:
-            budget_big = n_big * earned_tolerance(eps2, rule.relief2, n_big, own[big], var * rule.n_range)
-            budget_small = n_small * earned_tolerance(eps2, rule.relief2, n_small, own[small], var * rule.n_range)
+            noise2 = var * rule.n_range
+            budget_big = n_big * earned_tolerance(eps2, rule.relief2, n_big, own[big], noise2)
+            budget_small = n_small * earned_tolerance(eps2, rule.relief2, n_small, own[small], noise2)
         if rule.kind == CHOW:
             n = n_big + n_small
             ratio, need = _excess(rise_big + rise_small, noise + n * share, budget_big + budget_small)
@@ -298,10 +257,10 @@ def trace_inverse(moments, k, box, terms, work):  # type: ignore[no-untyped-def]
 
 @bare
 def _bayes(moments, big, small, rule, own, boxes, work):  # type: ignore[no-untyped-def]
-    """c_ib of eq. (21) for i = small, b = big, over n_i; and the average extrapolation error against the limits.
+    """c_ib of eq. (21) for i = small, b = big, over n_i; and the average extrapolation error over the limit.
 
-    Returns (c_ib / n_i, e): grouping may go on while e <= 1 (section 8: the average extrapolation error of range
-    and of colour each under its own threshold).
+    Returns (c_ib / n_i, e): grouping may go on while e <= 1 (section 8: the average extrapolation error of
+    range and of colour each under its own threshold).
     """
     n_small = moments.power[small, 0, 0]
     n_big = moments.power[big, 0, 0]
@@ -315,7 +274,8 @@ def _bayes(moments, big, small, rule, own, boxes, work):  # type: ignore[no-unty
         terms = rule.terms[rule.degree[big, modality]]
         # the big region's sums are about its own centre, and the small one's were moved there
         solve(moments.power[big], moments.cross[big], first, last, terms, work.gram, work.coef)
-        sigma2_ib = residual(work.power, work.cross, moments.energy[small], first, last, terms, work.coef)  # eq. (18)
+        # eq. (18)
+        sigma2_ib = residual(work.power, work.cross, moments.energy[small], first, last, terms, work.coef)
         p = terms.shape[0]
         dof = max(n_big - p, 1.0)
         sigma2_b = own[big, modality] / dof
@@ -363,7 +323,9 @@ def _predicted(moments, big, small, rule, gate_r, gate_c, work):  # type: ignore
 def compare(moments, i, j, rule, own, boxes, gate_r, gate_c, work):  # type: ignore[no-untyped-def]
     """Compare two regions.
 
-    own : (N, 5) residuals of each region's own models, see own_residuals; gate_r, gate_c : shares of the boundary free of edges
+    own : (N, 5) residuals of each region's own models, see `own_residuals`
+    boxes : (N, 4) boxes of the regions, for eq. (19)
+    gate_r, gate_c : shares of the boundary that are free of edges, of range and of colour
 
     Returns
     -------

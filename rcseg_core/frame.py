@@ -1,7 +1,7 @@
 """The input at the door: one registered pair of a range image and a colour image (section 2), and its camera.
 
-Everything is checked here, once; the rooms further in trust it. The range signal of a camera is inverse depth,
-because a plane seen through a pinhole is exactly linear in the pixel coordinates there (and nowhere else).
+Everything is checked here, once; the rooms further in trust it. The range signal of a camera is inverse
+depth, because a plane seen through a pinhole is exactly linear in the pixel coordinates there, not in z.
 """
 
 from __future__ import annotations
@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from rcseg_core.errors import InputError
 
-
-#: No range sensor measures nearer or farther; beyond, float32 cannot hold the signals. Such pixels are invalid.
+#: Pixels nearer or farther are invalid: no range sensor gives them, and float32 cannot hold their signals.
 MIN_DEPTH_M, MAX_DEPTH_M = 1e-9, 1e9
 
 
@@ -43,7 +42,7 @@ class PinholeCamera:
             raise InputError(f"camera: fx and fy must be positive pixels, got fx={self.fx}, fy={self.fy}")
 
     def rays(self, height: int, width: int) -> NDArray[np.float32]:
-        """(height, width, 3) float32 rays with z = 1; a point is ``ray * depth`` or ``ray / inverse depth``."""
+        """(height, width, 3) float32 rays, z = 1; a point is ``ray * depth`` or ``ray / inverse depth``."""
         rays = np.ones((height, width, 3), np.float32)
         rays[..., 0] = ((np.arange(width) - self.cx) / self.fx)[None, :]
         rays[..., 1] = ((np.arange(height) - self.cy) / self.fy)[:, None]
@@ -88,11 +87,11 @@ class RangeColorFrame:
             raise InputError(f"color: expected uint8 RGB, got {color.dtype}")
         if points.shape != color.shape:
             raise InputError(
-                f"points are {points.shape[1]}x{points.shape[0]} and color is {color.shape[1]}x{color.shape[0]}: "
+                f"points are {_size(points)} and color is {_size(color)}: "
                 "both must be registered in one pixel grid"
             )
         if min(points.shape[:2]) < 3:
-            raise InputError(f"the image is {points.shape[1]}x{points.shape[0]}: at least 3x3 pixels are needed")
+            raise InputError(f"the image is {_size(points)}: at least 3x3 pixels are needed")
         if self.camera is not None and not isinstance(self.camera, PinholeCamera):
             raise InputError(f"camera: expected a PinholeCamera or None, got {type(self.camera).__name__}")
         if not self.valid.any():
@@ -134,10 +133,16 @@ class RangeColorFrame:
     def valid(self) -> NDArray[np.bool_]:
         """(H, W) bool: finite points that a sensor can give; with a camera also in front of it."""
         z = self.points[..., 2]
-        finite = np.isfinite(self.points).all(axis=2)
+        valid: NDArray[np.bool_] = np.isfinite(self.points).all(axis=2)
         if self.camera is None:
-            return finite & (z != 0) & (np.abs(self.points).max(axis=2) <= MAX_DEPTH_M)
-        return finite & (z >= MIN_DEPTH_M) & (z <= MAX_DEPTH_M)
+            valid &= (z != 0) & (np.abs(self.points).max(axis=2) <= MAX_DEPTH_M)
+        else:
+            valid &= (z >= MIN_DEPTH_M) & (z <= MAX_DEPTH_M)
+        return valid
+
+
+def _size(image: NDArray[Any]) -> str:
+    return f"{image.shape[1]}x{image.shape[0]}"
 
 
 def _what(value: object) -> str:

@@ -1,8 +1,9 @@
 """Steps 5 and 7: a model grows in degree only when the statistics demand it (section 7, eq. 22-23).
 
-Nested F test: with residuals S_0 of degree j and S_1 of degree k > j, F = (r - 1)(n - p_1)/q for r = S_0/S_1 (22)
-and q more parameters; the higher degree is taken when P(F(q, n - p_1) >= F) < alpha (23). At n = 10^4 that test
-alone generalises on a tenth of a sigma of quantisation, so the default also asks for an effect worth having.
+Nested F test: with residuals S_0 of degree j and S_1 of degree k > j, F = (r - 1)(n - p_1)/q for r = S_0/S_1
+(22) and q more parameters; the higher degree is taken when P(F(q, n - p_1) >= F) < alpha (23). At n = 10^4
+that test alone generalises on a tenth of a sigma of quantisation, so the default also asks for an effect
+worth having.
 """
 
 from __future__ import annotations
@@ -77,11 +78,12 @@ def choose_degrees(
     terms = tuple(tensor_exponents(k) for k in range(5))
     table = np.zeros((moments.energy.shape[0], 2, 4))
     residual_table(moments, n_range, terms, table)
-    degree = start.copy()
+    degree: NDArray[np.int64] = start.copy()
     n = moments.count
     index = np.arange(n.size)
     tops = (min(config.max_range_degree, highest), min(config.max_color_degree, highest))
-    for modality, (width, top) in enumerate(zip((n_range, channels - n_range), tops)):
+    widths = (n_range, channels - n_range)
+    for modality, (width, top) in enumerate(zip(widths, tops, strict=True)):
         for high in range(2, min(top, moments.cross.shape[2] - 1) + 1):
             for low in range(1, high):
                 rss_low, rss_high = table[:, modality, low - 1], table[:, modality, high - 1]

@@ -1,8 +1,8 @@
-"""Steps 3, 4 and 6: best-first grouping of adjacent regions until the best grouping exceeds the limit (section 6).
+"""Steps 3, 4 and 6: best-first grouping of adjacent regions until the best one exceeds the limit (section 6).
 
-A heap holds every allowed pair; the best is merged, its moments added, and the pairs around it compared again.
-Entries made stale by a merge are left in the heap and skipped when they surface (lazy invalidation). Ties are
-broken by (value, lower id, higher id): a frame always gives the same labels. Nothing here touches a pixel.
+A heap holds every allowed pair; the best is merged, its moments added, and the pairs around it compared
+again. Entries made stale by a merge are left in the heap and skipped when they surface (lazy invalidation).
+Ties are broken by (value, lower id, higher id): a frame always gives the same labels. No pixel is touched.
 """
 
 from __future__ import annotations
@@ -13,76 +13,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rcseg_core.adjacency import Pairs
-from rcseg_core.evidence import BOUNDED, CHOW, Rule, Work, compare, compare_planes, make_work, move, own_residuals
+from rcseg_core.evidence import Work, compare, compare_planes, make_work, move, own_residuals
+from rcseg_core.graph import make_graph, merge_edges
 from rcseg_core.jit import bare
 from rcseg_core.moments import Moments
 from rcseg_core.planes import Planes, add_planes, center_planes
+from rcseg_core.rule import BOUNDED, CHOW, Rule
 
-#: All pairs of a region are compared again once it has grown by this; before that only those of the smaller side.
+#: All pairs of a region are compared again once it has grown by this; until then those of the smaller side.
 GROWTH = 1.3
 
 
-class Graph(NamedTuple):
-    """Incidence lists over half-edges: half-edge 2e is edge e seen from ends[e, 0], 2e + 1 from ends[e, 1].
-
-    ends : (E, 2) int64; first, last : (N,) int64 half-edge or -1; length : (N,) int64 entries of each list, dead
-    ones included until they are met; following : (2E,) int64;
-    alive : (E,) bool; version : (E,) int64; boundary, range_crossed, color_crossed : (E,) float64;
-    height : (E,) float64, multiple of the approximation limit that the pair needed when last compared
-    """
-
-    ends: NDArray[np.int64]
-    first: NDArray[np.int64]
-    last: NDArray[np.int64]
-    length: NDArray[np.int64]
-    following: NDArray[np.int64]
-    alive: NDArray[np.bool_]
-    version: NDArray[np.int64]
-    boundary: NDArray[np.float64]
-    range_crossed: NDArray[np.float64]
-    color_crossed: NDArray[np.float64]
-    height: NDArray[np.float64]
-
-
-def make_graph(pairs: Pairs, count: int) -> Graph:
-    """Incidence lists of regions 1..count; the arrays of `pairs` are copied."""
-    n = pairs.nodes.shape[0]
-    graph = Graph(
-        pairs.nodes.copy(),
-        np.full(count + 1, -1, np.int64),
-        np.full(count + 1, -1, np.int64),
-        np.zeros(count + 1, np.int64),
-        np.full(2 * n, -1, np.int64),
-        np.ones(n, np.bool_),
-        np.zeros(n, np.int64),
-        pairs.boundary.copy(),
-        pairs.range_crossed.copy(),
-        pairs.color_crossed.copy(),
-        np.zeros(n),
-    )
-    _link(graph)
-    return graph
-
-
-@bare
-def _link(graph):  # type: ignore[no-untyped-def]
-    for half in range(2 * graph.ends.shape[0]):
-        _append(graph, graph.ends[half // 2, half % 2], half)
-
-
-@bare
-def _append(graph, node, half):  # type: ignore[no-untyped-def]
-    if graph.first[node] < 0:
-        graph.first[node] = half
-    else:
-        graph.following[graph.last[node]] = half
-    graph.last[node] = half
-    graph.following[half] = -1
-    graph.length[node] += 1
-
-
 class Heap(NamedTuple):
-    """A binary heap of pairs, smallest (value, pair) on top; pair = lower id * (N + 1) + higher id breaks ties.
+    """A binary heap of pairs, smallest (value, pair) on top; pair = lower id * (N + 1) + higher id for ties.
 
     value : (n,) float64; pair, edge, version : (n,) int64
     """
@@ -237,7 +180,7 @@ def _recenter(moments, k, box, work):  # type: ignore[no-untyped-def]
 
 @bare
 def _join(keep, gone, state):  # type: ignore[no-untyped-def]
-    """Region `keep` takes in `gone`: moments, box, the higher degree of the two, and its own residuals anew."""
+    """Region `keep` takes in `gone`: moments, box, the higher degree of the two; its residuals anew."""
     boxes = state.boxes
     boxes[keep, 0] = min(boxes[keep, 0], boxes[gone, 0])
     boxes[keep, 1] = min(boxes[keep, 1], boxes[gone, 1])
@@ -256,68 +199,8 @@ def _join(keep, gone, state):  # type: ignore[no-untyped-def]
 
 
 @bare
-def _find_edge(graph, node, target):  # type: ignore[no-untyped-def]
-    """The living edge between two nodes, or -1; dead entries met on the way are unlinked from the list of `node`."""
-    before = np.int64(-1)
-    half = graph.first[node]
-    while half >= 0:
-        following = graph.following[half]
-        if graph.alive[half // 2]:
-            if graph.ends[half // 2, 1 - half % 2] == target:
-                return half // 2
-            before = half
-        else:
-            if before < 0:
-                graph.first[node] = following
-            else:
-                graph.following[before] = following
-            if graph.last[node] == half:
-                graph.last[node] = before
-            graph.length[node] -= 1
-        half = following
-    return np.int64(-1)
-
-
-@bare
-def _merge_edges(graph, keep, gone, fresh):  # type: ignore[no-untyped-def]
-    """Give the edges of `gone` to `keep`; parallel edges become one. Lists in `fresh` what must be compared anew.
-
-    Only the list of `gone` is walked, and for each of its neighbours the shorter of two lists: the list of a large
-    region is long. Returns how many edges are fresh.
-    """
-    count = 0
-    half = graph.first[gone]
-    while half >= 0:
-        following = graph.following[half]
-        edge = half // 2
-        if graph.alive[edge]:
-            other = graph.ends[edge, 1 - half % 2]
-            if other == keep:
-                graph.alive[edge] = False
-            else:
-                if graph.length[other] <= graph.length[keep]:
-                    twin = _find_edge(graph, other, keep)
-                else:
-                    twin = _find_edge(graph, keep, other)
-                if twin >= 0:
-                    graph.boundary[twin] += graph.boundary[edge]
-                    graph.range_crossed[twin] += graph.range_crossed[edge]
-                    graph.color_crossed[twin] += graph.color_crossed[edge]
-                    graph.alive[edge] = False
-                    fresh[count] = twin
-                else:
-                    graph.ends[edge, half % 2] = keep
-                    _append(graph, keep, half)
-                    fresh[count] = edge
-                count += 1
-        half = following
-    graph.first[gone] = -1
-    return count
-
-
-@bare
 def _run(graph, state, scratch, gated, limit, merges, heights):  # type: ignore[no-untyped-def]
-    """Best-first loop. Fills merges (kept, gone) and heights; returns how many, and the number of comparisons."""
+    """Best-first loop. Fills merges (kept, gone) and heights; returns how many, and the comparisons made."""
     count = state.boxes.shape[0] - 1
     edges = graph.ends.shape[0]
     full_at = scratch.full_at
@@ -349,7 +232,7 @@ def _run(graph, state, scratch, gated, limit, merges, heights):  # type: ignore[
         heights[merged] = graph.height[edge]
         merged += 1
         _join(keep, gone, state)
-        fresh_count = _merge_edges(graph, keep, gone, fresh)
+        fresh_count = merge_edges(graph, keep, gone, fresh)
         grown = _size(state, keep)
         if grown >= GROWTH * full_at[keep]:
             full_at[keep] = grown
@@ -375,7 +258,7 @@ class Scratch(NamedTuple):
 
 
 def make_scratch(edges: int, count: int) -> Scratch:
-    """Arrays for `_run`. An edge has one entry that holds; the others are stale and dropped when room is short."""
+    """Arrays for `_run`. One entry of an edge holds; the others are stale and dropped when room is short."""
     room = 4 * edges + 64
     heap = Heap(np.empty(room), np.empty(room, np.int64), np.empty(room, np.int64), np.empty(room, np.int64))
     return Scratch(heap, np.empty(max(edges, 1), np.int64), np.empty(count + 1))
@@ -413,9 +296,9 @@ def group(
     )  # fmt: skip
     merges = np.empty((count, 2), np.int64)
     heights = np.empty(count)
-    merged, comparisons = _run(
-        make_graph(pairs, count - 1), state, make_scratch(len(pairs.boundary), count - 1), gated, 0.0 if limit <= 1.0 else limit, merges, heights
-    )
+    beyond = limit if limit > 1.0 else 0.0  # what the rule itself allows needs no second limit
+    graph, scratch = make_graph(pairs, count - 1), make_scratch(len(pairs.boundary), count - 1)
+    merged, comparisons = _run(graph, state, scratch, gated, beyond, merges, heights)
     return Grouped(merges[:merged], heights[:merged], int(comparisons))
 
 

@@ -1,9 +1,9 @@
-"""The merge tree: every grouping is kept, so that the partition can be cut finer or coarser without segmenting again.
+"""The merge tree: every grouping is kept, so that it can be cut finer or coarser without segmenting again.
 
 Leaves 1..L are the seeds; merge t makes node L + t. The height of a node is the multiple of the approximation
-limit eps_t that its merges needed (0: noise alone explains them), made monotone towards the root. So level 1 is
-the result, below 1 a finer one; above 1 the grouping goes on from the regions with a limit that many times as
-wide.
+limit eps_t that its merges needed (0: noise alone explains them), made monotone towards the root. So level 1
+is the result, below 1 a finer one; above 1 the grouping goes on from the regions with a limit that many times
+as wide.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Hierarchy:
         return parent
 
     def cut(self, level: float) -> NDArray[np.int64]:
-        """(node_count + 1,) int64: for each node its highest ancestor whose height is at most `level`, or itself."""
+        """(node_count + 1,) int64: the highest ancestor of each node no higher than `level`, or itself."""
         parent = self.parents()
         top = np.arange(self.node_count + 1)
         for node in range(self.node_count, 0, -1):  # parents have higher numbers than their children

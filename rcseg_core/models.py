@@ -1,4 +1,4 @@
-"""Models of regions as they are used on pixels: polynomials about the region's own centre, range and colour apart."""
+"""Models of regions as pixels see them: polynomials about the region's own centre, range and colour apart."""
 
 from __future__ import annotations
 
@@ -37,9 +37,7 @@ def _fit(moments, degree, first, last, modality, terms, models_degree, coef, gra
                 coef[k, c, terms[i, 0], terms[i, 1]] = flat[c, i]
 
 
-def fit_models(
-    moments: Moments, degree: NDArray[np.int64], n_range: int, planes: bool = False
-) -> Models:
+def fit_models(moments: Moments, degree: NDArray[np.int64], n_range: int, planes: bool = False) -> Models:
     """Least-squares models, eq. (13), of the given degrees.
 
     Parameters

@@ -1,9 +1,9 @@
 """Additive sufficient statistics of a region: all that eq. (12)-(14) need, without its pixels.
 
-A region keeps the power sums ``sum x^a y^b`` (a, b <= 2k: the Gram matrix R of every model up to degree k), the
-cross sums ``sum x^a y^b s`` (a, b <= k: V) and the energies ``sum s^2`` (T T^T), about a centre of its own: normal
-equations in image coordinates are unusable (condition 1e17). x and y are pixels / UNIT_PX. Sums add only about one
-centre; `shift` moves them there binomially.
+A region keeps the power sums ``sum x^a y^b`` (a, b <= 2k: the Gram matrix R of every model up to degree k),
+the cross sums ``sum x^a y^b s`` (a, b <= k: V) and the energies ``sum s^2`` (T T^T), about a centre of its
+own: normal equations in image coordinates are unusable (condition 1e17). x and y are pixels / UNIT_PX. Sums
+add only about one centre; `shift_grid` moves them there binomially.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Moments(NamedTuple):
     energy: NDArray[np.float64]
 
     @property
-    def count(self) -> NDArray[np.float64]:
+    def count(self) -> NDArray[np.float64]:  # type: ignore[override]  # no one counts values of a tuple here
         """(N,) number of pixels."""
         return self.power[:, 0, 0]
 
@@ -71,7 +71,7 @@ def region_boxes(labels, count):  # type: ignore[no-untyped-def]
 
 @kernel
 def _sum_runs(image, flags, labels, center, power, cross, energy):  # type: ignore[no-untyped-def]
-    """One pass over the image: each run of one label in a row is summed in x, then spread over the powers of y."""
+    """One pass over the image: a run of one label in a row is summed in x, then spread over powers of y."""
     height, width, channels = image.shape
     top = power.shape[1]
     low = cross.shape[2]
@@ -140,7 +140,8 @@ def accumulate(
 def shift_grid(grid, dx, dy, out, work):  # type: ignore[no-untyped-def]
     """Sums of x^a y^b (weighted or not) about an origin moved by (-dx, -dy): sum (x+dx)^a (y+dy)^b.
 
-    Binomial theorem by repeated addition (x+dx)^a = (x+dx)^(a-1) x + (x+dx)^(a-1) dx, separably. work : like grid.
+    Binomial theorem by repeated addition (x+dx)^a = (x+dx)^(a-1) x + (x+dx)^(a-1) dx, separably.
+    work : like grid.
     """
     size = grid.shape[0]
     for b in range(size):

@@ -1,13 +1,13 @@
-"""The noise Sigma_r and Sigma_c that eq. (3) whitens with: measured on the frame, or taken from a sensor model.
+"""The noise Sigma_r and Sigma_c that eq. (3) whitens with: measured on the frame, or a sensor's model.
 
 Window residuals about a robust plane tell the noise wherever a scene is smooth; their lower quantile ignores
 windows on edges and texture. Second differences would be zero on quantised depth. Structured-light depth and
-demosaiced colour are correlated over a few pixels, so n of them are worth fewer: the means of 5x5 blocks of the
-residuals tell how many pixels make one independent measurement.
+demosaiced colour are correlated over a few pixels, so n of them are worth fewer: the means of 5x5 blocks of
+the residuals tell how many pixels make one independent measurement.
 
-The standard deviation of the range signal is a quadratic of the signal itself, ``sigma(w) = a + b w + c w^2``,
-which holds every usual sensor: structured light and stereo (a), constant depth noise (c, since dw = w^2 dz) and
-Kinect after Nguyen et al. (all three).
+The standard deviation of the range signal is a quadratic of the signal itself,
+``sigma(w) = a + b w + c w^2``, which holds every usual sensor: structured light and stereo (a), constant
+depth noise (c, since dw = w^2 dz) and Kinect after Nguyen et al. (all three).
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ class NoiseModel:
     Attributes
     ----------
     range_law : (Cr, 3) float64
-        ``sigma_c(s) = a + b s + c s^2`` for range channel c and signal value s: 1/m of inverse depth, or metres of
-        x, y, z (constant then: b = c = 0).
+        ``sigma_c(s) = a + b s + c s^2`` for range channel c and signal value s: 1/m of inverse depth, or
+        metres of x, y, z (constant then: b = c = 0).
     color : (3,) float64, levels.
     range_correlation, color_correlation : pixels that make one independent measurement, 1 for white noise
     source : str
@@ -65,7 +65,7 @@ class NoiseModel:
     source: str
 
     def range_sigma(self, signal: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Standard deviation of the first range channel at signal values (any shape), in units of the signal."""
+        """Standard deviation of the first range channel at signal values (any shape), in their units."""
         a, b, c = self.range_law[0]
         return np.asarray(a + b * signal + c * signal * signal, np.float64)
 
@@ -74,9 +74,10 @@ class NoiseModel:
 def window_residuals(values, median, valid, spread, stride, out):  # type: ignore[no-untyped-def]
     """Residuals about a plane in windows of one channel, impulses (> 6 spread from the median) left out.
 
-    values, median : (H, W) float32; valid : (H, W) bool; spread : scale of values - median; out : (n, 4) float64,
-    mean, rms, the mean square of 5x5 block means times 25, and the mean size of the steps between pixels that
-    differ, beside the slope (the quantum of a quantised sensor); NaN where under half of a window is usable.
+    values, median : (H, W) float32; valid : (H, W) bool; spread : scale of values - median; out : (n, 4)
+    float64, mean, rms, the mean square of 5x5 block means times 25, and the mean size of the steps between
+    pixels that differ, beside the slope (the quantum of a quantised sensor); NaN where under half of a window
+    is usable.
     """
     height, width = values.shape
     half = WINDOW_PX // 2
@@ -155,7 +156,7 @@ def window_residuals(values, median, valid, spread, stride, out):  # type: ignor
 
 
 class _Windows(NamedTuple):
-    """Usable windows of one channel: mean and residual rms of each, and the correlation of the quieter half."""
+    """Usable windows of one channel: mean and residual rms of each; the correlation of the quieter half."""
 
     mean: NDArray[np.float64]
     rms: NDArray[np.float64]
@@ -237,7 +238,7 @@ def estimate_noise(
     scale = float(np.median(np.abs(signal[..., -1][valid])))
     floor = RELATIVE_FLOOR * scale
     windows = [_measure(signal[..., c], median[..., c], valid) for c in range(signal.shape[2])]
-    source = config.range_model
+    source: str = config.range_model
     if config.range_model == "auto":
         source = "estimated"
         if inverse_depth:

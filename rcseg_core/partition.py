@@ -1,8 +1,8 @@
 """The partition while it is being built: label image, leaf image and merge tree, kept in step.
 
-`labels` are the current regions 1..count; `leaves` the seeds that every pixel came with. The tree links the two.
-What is measured of the regions (moments, boxes, pairs) is kept until a pixel changes its region: grouping adds
-moments and joins pairs, so several passes need the image only once.
+`labels` are the current regions 1..count; `leaves` the seeds that every pixel came with. The tree links the
+two. What is measured of the regions (moments, boxes, pairs) is kept until a pixel changes its region:
+grouping adds moments and joins pairs, so several passes need the image only once.
 """
 
 from __future__ import annotations
@@ -57,9 +57,7 @@ def count_together(first, second, counts):  # type: ignore[no-untyped-def]
 class Partition:
     """Regions 1..count over the pixels (0 unassigned) and the tree that led to them."""
 
-    def __init__(
-        self, seeds: NDArray[np.int32], count: int, within: NDArray[np.int32] | None = None
-    ) -> None:
+    def __init__(self, seeds: NDArray[np.int32], count: int, within: NDArray[np.int32] | None = None) -> None:
         #: (H, W) int32 or None: regions never reach from one value of it to another
         self.within = within
         self.labels = seeds
@@ -80,12 +78,14 @@ class Partition:
         """Moments of the regions for models up to `degree` or more; grouping may add them up in place."""
         kept = self._moments
         if kept is None or kept.cross.shape[2] <= degree or kept.cross.shape[1] != signals.image.shape[2]:
-            self._moments = accumulate(signals.image, signals.flags, self.labels, self.count, degree)
-        return self._moments
+            kept = accumulate(signals.image, signals.flags, self.labels, self.count, degree)
+            self._moments = kept
+        return kept
 
     def sizes(self) -> NDArray[np.int64]:
         """(count + 1,) pixels of each region; index 0: unassigned ones."""
-        return count_pixels(self.labels, self.count)
+        sizes: NDArray[np.int64] = count_pixels(self.labels, self.count)
+        return sizes
 
     def boxes(self) -> NDArray[np.int64]:
         """(count + 1, 4) boxes of the regions; grouping may join them in place."""
@@ -110,7 +110,7 @@ class Partition:
             self.forget()
 
     def apply(self, grouped: Grouped) -> NDArray[np.int64]:
-        """Carry out the merges: relabel and record them. Returns the old label of each new region, (count + 1,)."""
+        """Carry out the merges: relabel, record. Returns the old label of each new region, (count + 1,)."""
         if not len(grouped.merges):
             return np.arange(self.count + 1)
         self.tree.merge(grouped.merges, grouped.heights, self.nodes)
@@ -123,7 +123,7 @@ class Partition:
         return alive
 
     def _relabel(self, mapping: NDArray[np.int32], alive: NDArray[np.int64]) -> None:
-        """New label of each old one (0: freed) and old label of each new one; what was measured goes along."""
+        """New label of each old one (0: freed), old label of each new one; measurements go along."""
         relabel(self.labels, mapping)
         self.nodes = self.nodes[alive]
         self.count = alive.size - 1
@@ -135,7 +135,7 @@ class Partition:
             self._pairs = self._pairs.relabelled(mapping)
 
     def add_leftovers(self, candidates: NDArray[np.bool_], least: int) -> int:
-        """Connected unassigned pixels become regions where at least `least` hang together; returns how many did."""
+        """Unassigned pixels become regions where at least `least` hang together; returns how many regions."""
         rest = (candidates & (self.labels == 0)).astype(np.uint8)
         if not rest.any():
             return 0
@@ -185,7 +185,7 @@ class Partition:
         return group
 
     def sort_by_size(self) -> NDArray[np.int64]:
-        """Number the regions from the largest down (ties by number), without gaps; returns the old numbers."""
+        """Number the regions from the largest down (ties by number), without gaps; returns old numbers."""
         sizes = self.sizes()
         order = np.argsort(-sizes[1:], kind="stable") + 1
         order = order[sizes[order] > 0]

@@ -8,25 +8,30 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from rcseg_core.adjacency import spread
 from rcseg_core.config import SegmenterConfig
 from rcseg_core.description import describe_regions
 from rcseg_core.edges import RANGE_EDGES, detect_edges
 from rcseg_core.errors import ConfigError
 from rcseg_core.frame import RangeColorFrame
-from rcseg_core.models import Models
-from rcseg_core.partition import Partition, count_together
+from rcseg_core.partition import Partition
 from rcseg_core.reflectance import normalize_reflectance
 from rcseg_core.seeds import initial_partition
 from rcseg_core.segmentation import Segmentation
-from rcseg_core.signals import INVALID, MISFIT, Signals, build_signals
-from rcseg_core.stages import absorb_small, coarser_merges, final_models, group_pass, surfaces_of, top_degree
-
+from rcseg_core.signals import Signals, build_signals
+from rcseg_core.stages import (
+    absorb_points,
+    absorb_small,
+    coarser_merges,
+    final_models,
+    group_pass,
+    link_signals,
+    settle,
+    top_degree,
+)
+from rcseg_core.surfaces import bridge_holes, majority, number_surfaces, surfaces_of
 
 #: Rounds of regrouping after the points are settled; two are seldom needed.
 MAX_ROUNDS = 3
-#: Holes up to twice this wide are bridged when surfaces bound the windows of colour.
-HOLE_PX = 4
 
 
 def segment(
@@ -57,58 +62,28 @@ def segment(
         raise ConfigError(f"config: expected a SegmenterConfig, got {type(config).__name__}")
     clock = Clock()
 
-    # 1. normalise the colour (section 3)
+    # 1. normalise the colour (section 3) and find the discontinuities (section 8)
     color = normalize_reflectance(frame, config.reflectance, white_reference)
     signals = build_signals(frame, color, config)
     clock.lap("signals")
-
     edges = detect_edges(signals, config.edges)
     clock.lap("edges")
 
-    # 2-8 on the range alone give the surfaces, then on the colour of each surface its regions; or jointly
+    # 2-8. on both signals jointly; or on the range alone, which gives the surfaces ...
     surfaces: Partition | None = None
     if config.grouping.order == "joint":
         partition = partition_by(signals, edges, config, None, clock, "joint")
     else:
         surfaces = partition_by(signals.range_only(), edges & RANGE_EDGES, config, None, clock, "range")
         partition = surfaces
-        if config.grouping.order == "surfaces_first":
-            within = bridge_holes(surfaces.labels)
-            partition = partition_by(signals.color_only(), edges, config, within, clock, "color")
 
-    # the two linked: both signals together decide what small regions and border pixels belong to
-    if config.absorption.enabled and config.grouping.order == "surfaces_first":
-        partition.within = None
-        partition.forget()
-        settle(partition, signals, config)
-        absorb_small(partition, signals, edges, config)
-    partition.sort_by_size()
-    moments, models = final_models(partition, signals, config)
-    boxes, pairs = partition.boxes(), partition.pairs(edges, config.grouping.max_gap)
-    if surfaces is None:
-        surface_of = surfaces_of(partition, signals, moments, boxes, pairs, config)
-    else:
-        surface_of = majority(partition, surfaces)
-    surface_labels, surface_of = number_surfaces(partition, surface_of)
-    clock.lap("models")
-    return Segmentation(
-        labels=partition.labels,
-        surface_labels=surface_labels,
-        tree=partition.tree.build(),
-        range_tree=surfaces.tree.build() if surfaces is not None else None,
-        edges=edges,
-        timings=clock.seconds,
-        camera=frame.camera,
-        signals=signals,
-        models=models,
-        leaves=partition.leaves,
-        range_leaves=surfaces.leaves if surfaces is not None else None,
-        nodes=partition.nodes,
-        coarsen=partial(coarser_merges, signals, moments, boxes, pairs, config),
-        describe=partial(
-            describe_regions, frame, signals, partition.labels, surface_of, moments, models, boxes, pairs
-        ),
-    )
+    # ... then on the colour of each surface; and both decide what small regions and border pixels belong to
+    if surfaces is not None and config.grouping.order == "surfaces_first":
+        within = bridge_holes(surfaces.labels)
+        partition = partition_by(signals.color_only(), edges, config, within, clock, "color")
+        if config.absorption.enabled:
+            link_signals(partition, signals, edges, config)
+    return conclude(frame, signals, edges, partition, surfaces, config, clock)
 
 
 def degrees(config: SegmenterConfig, signals: Signals) -> list[int]:
@@ -160,63 +135,38 @@ def partition_by(
     return partition
 
 
-def bridge_holes(labels: NDArray[np.int32]) -> NDArray[np.int32]:
-    """`labels` spread over holes of a few pixels, so that missing pixels do not fence in the windows of colour."""
-    bridged, met = np.empty_like(labels), np.empty(labels.shape, np.uint8)
-    spread(labels, np.zeros(labels.shape, np.uint8), HOLE_PX, bridged, met)
-    return bridged
-
-
-def absorb_points(partition: Partition, signals: Signals, models: Models, config: SegmenterConfig) -> int:
-    """Step 3: points join the regions that predict them; what hangs together and fits nowhere is a region.
-
-    Returns the number of regions that were added.
-    """
-    partition.absorb(signals, models, config.absorption.max_cost)
-    measured = signals.flags & INVALID == 0
-    return partition.add_leftovers(measured, scaled(config.absorption.min_region, signals.flags))
-
-
-def settle(partition: Partition, signals: Signals, config: SegmenterConfig) -> None:
-    """Specks dissolve into the neighbours that predict them; every measured pixel gets a region."""
-    partition.drop_small(scaled(config.absorption.speck, signals.flags))
-    models = final_models(partition, signals, config)[1]
-    if absorb_points(partition, signals, models, config):
-        models = final_models(partition, signals, config)[1]
-    unpredicted = partition.labels == 0
-    for limit in (1e4, 1e12):  # the order still matters; the limit no longer does
-        partition.absorb(signals, models, limit)
-    signals.flags[unpredicted & (partition.labels > 0)] |= MISFIT
-    if partition.within is None:
-        partition.refine(signals, models, config.absorption.refine_passes)
-    else:  # small parts of `within` that no region reached
-        partition.add_leftovers((partition.within > 0) & (signals.flags & INVALID == 0), 1)
-
-
-def majority(partition: Partition, surfaces: Partition) -> NDArray[np.int64]:
-    """(count + 1,) the surface that holds most of each region's pixels (the lowest of equals)."""
-    counts = np.zeros((partition.count + 1, surfaces.count + 1), np.int64)
-    count_together(partition.labels, surfaces.labels, counts)
-    return np.argmax(counts, axis=1)
-
-
-def number_surfaces(
-    partition: Partition, surface_of: NDArray[np.int64]
-) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
-    """Surfaces numbered from the largest down: the label image, and the number of each region's surface."""
-    sizes = np.bincount(surface_of, partition.sizes(), minlength=int(surface_of.max()) + 1)
-    sizes[surface_of[0]] -= partition.sizes()[0]
-    order = np.argsort(-sizes, kind="stable")
-    rank = np.empty(order.size, np.int64)
-    rank[order] = np.arange(1, order.size + 1)
-    number = rank[surface_of]
-    number[0] = 0
-    return number.astype(np.int32)[partition.labels], number
-
-
-def scaled(pixels: int, image: NDArray[np.uint8]) -> int:
-    """An area that is given for 640x480, for the size of this image."""
-    return max(4, round(pixels * image.size / (640 * 480)))
+def conclude(
+    frame: RangeColorFrame, signals: Signals, edges: NDArray[np.uint8], partition: Partition,
+    surfaces: Partition | None, config: SegmenterConfig, clock: Clock,
+) -> Segmentation:  # fmt: skip
+    """The result: regions by size with their models; patches and coarser levels follow when asked for."""
+    partition.sort_by_size()
+    moments, models = final_models(partition, signals, config)
+    boxes, pairs = partition.boxes(), partition.pairs(edges, config.grouping.max_gap)
+    if surfaces is None:
+        surface_of = surfaces_of(partition, signals, moments, boxes, pairs, config)
+    else:
+        surface_of = majority(partition, surfaces)
+    surface_labels, surface_of = number_surfaces(partition, surface_of)
+    clock.lap("models")
+    return Segmentation(
+        labels=partition.labels,
+        surface_labels=surface_labels,
+        tree=partition.tree.build(),
+        range_tree=surfaces.tree.build() if surfaces is not None else None,
+        edges=edges,
+        timings=clock.seconds,
+        camera=frame.camera,
+        signals=signals,
+        models=models,
+        leaves=partition.leaves,
+        range_leaves=surfaces.leaves if surfaces is not None else None,
+        nodes=partition.nodes,
+        coarsen=partial(coarser_merges, signals, moments, boxes, pairs, config),
+        describe=partial(
+            describe_regions, frame, signals, partition.labels, surface_of, moments, models, boxes, pairs
+        ),
+    )
 
 
 class Clock:

@@ -1,8 +1,8 @@
 """First-degree grouping in closed form: centred second moments of a region instead of power sums.
 
-A plane has three coefficients, so everything that `evidence` asks of two regions is a handful of products. With
-the spread (Sxx, Sxy, Syy) of a region's pixels about their mean, another plane that differs from its own by dv at
-the mean and by (dgx, dgy) in slope costs it exactly
+A plane has three coefficients, so everything that `evidence` asks of two regions is a handful of products.
+With the spread (Sxx, Sxy, Syy) of a region's pixels about their mean, another plane that differs from its own
+by dv at the mean and by (dgx, dgy) in slope costs it exactly
 
     rise = n dv^2 + Sxx dgx^2 + 2 Sxy dgx dgy + Syy dgy^2
 
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from rcseg_core.jit import bare
 from rcseg_core.moments import UNIT_PX, Moments
 
-#: Spread below this share of its square root trace is a line of pixels: the slope across it is not determined.
+#: Pixels whose spread has a determinant below this share of its squared trace lie on a line: no slope across.
 LEAST_SPREAD = 1e-9
 
 

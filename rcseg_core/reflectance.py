@@ -22,7 +22,7 @@ NORMAL_WINDOW_PX = 9
 
 
 def pixel_normals(points: NDArray[Any], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """(H, W, 3) float32 unit normals towards the sensor, from smoothed differences; NaN where none can be had."""
+    """(H, W, 3) float32 unit normals towards the sensor, from smoothed differences; NaN where unknown."""
     weight = valid.astype(np.float32)
     size = (NORMAL_WINDOW_PX, NORMAL_WINDOW_PX)
     share = cv2.boxFilter(weight, -1, size)
@@ -71,9 +71,9 @@ def normalize_reflectance(
 
     Notes
     -----
-    Where the geometry is unknown the correction of the whole frame's median is used, so that those pixels keep
-    their place among their neighbours. "active" is scaled to keep the median brightness; "calibrated" maps the
-    white board to 255.
+    Where the geometry is unknown the correction of the whole frame's median is used, so that those pixels
+    keep their place among their neighbours. "active" is scaled to keep the median brightness; "calibrated"
+    maps the white board to 255.
     """
     if config.mode == "none":
         return frame.color
@@ -84,7 +84,8 @@ def normalize_reflectance(
             raise InputError("reflectance.mode is calibrated: a white-reference frame is needed (eq. 6)")
         if white.color.shape != frame.color.shape:
             raise InputError(
-                f"the white-reference frame is {white.width}x{white.height}, the frame {frame.width}x{frame.height}"
+                f"the white-reference frame is {white.width}x{white.height}, "
+                f"the frame {frame.width}x{frame.height}"
             )
         r2_white, cosine_white = incidence(white, config.min_cosine)
         incident = white.color * (r2_white / cosine_white)[..., None]  # eq. (6)

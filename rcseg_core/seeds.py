@@ -1,10 +1,10 @@
 """Step 2: the initial partition, windows of 11 to 3 pixels with a least-median-of-squares fit (section 5).
 
-For each window size, largest first: every window without edge and without assigned pixel gets a first-order model
-of range and colour; outliers of the fit are released for other regions. A window whose plain least-squares
-residual is already pure noise needs no robust search (``fit = "auto"``); the others get 72 random planes, judged
-by the median of the joint Mahalanobis residual, whose scale in d dimensions is med/chi2_{d,0.5} with the cut at
-chi2_{d,0.975}.
+For each window size, largest first: every window without edge and without assigned pixel gets a first-order
+model of range and colour; outliers of the fit are released for other regions. A window whose plain
+least-squares residual is already pure noise needs no robust search (``fit = "auto"``); the others get 72
+random planes, judged by the median of the joint Mahalanobis residual, whose scale in d dimensions is
+med/chi2_{d,0.5} with the cut at chi2_{d,0.975}.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from rcseg_core.config import SeedsConfig
 from rcseg_core.jit import kernel
 from rcseg_core.signals import Signals, local_scales
 
-#: Windows beyond the largest of the paper, tried first and taken only where plain least squares leaves pure noise:
-#: fewer seeds to group on wide plain surfaces.
+#: Windows beyond the largest of the paper, tried first and taken only where plain least squares leaves pure
+#: noise: fewer seeds to group on wide plain surfaces.
 WIDE_WINDOWS_PX = (31, 19)
 #: A seed must keep this share of its usable pixels as inliers (LMS breaks down at half).
 MIN_INLIERS = 0.5
@@ -41,8 +41,8 @@ def _random(state):  # type: ignore[no-untyped-def]
 def fit_plane(samples, use, count, coef):  # type: ignore[no-untyped-def]
     """Least-squares planes through the used samples of a window.
 
-    samples : (m, 2 + C) float64, columns x, y, then the channels; use : (m,) bool; coef : (C, 3) float64 out, the
-    value at the window centre and the slopes. Returns False where the samples do not span a plane.
+    samples : (m, 2 + C) float64, columns x, y, then the channels; use : (m,) bool; coef : (C, 3) float64 out,
+    the value at the window centre and the slopes. Returns False where the samples do not span a plane.
     """
     channels = samples.shape[1] - 2
     s0 = sx = sy = sxx = sxy = syy = 0.0
@@ -162,7 +162,7 @@ def lms_inliers(samples, count, n_range, w_r, w_c, half, cut, subsets, state, co
 
 @kernel
 def _fits(samples, use, count, coef, n_range, var, eps2_r, eps2_c):  # type: ignore[no-untyped-def]
-    """Whether range and colour residuals of the used samples are noise (within NOISE_FACTOR) plus tolerance."""
+    """Whether the residuals of the used samples are noise (within NOISE_FACTOR) plus tolerance."""
     channels = samples.shape[1] - 2
     n = 0
     rss_r = 0.0
@@ -185,7 +185,10 @@ def _fits(samples, use, count, coef, n_range, var, eps2_r, eps2_c):  # type: ign
 
 
 @kernel
-def _try_window(image, flags, row0, col0, size, n_range, law, eps2_c, half, cut, search, robust, subsets, min_valid, work, labels, label):  # type: ignore[no-untyped-def]
+def _try_window(  # type: ignore[no-untyped-def]
+    image, flags, row0, col0, size, n_range, law, eps2_c, half, cut, search, robust, subsets, min_valid, work,
+    labels, label,
+):  # fmt: skip
     """Fit one free window; write its inliers as `label`. Returns the number of pixels, 0 if it is no seed."""
     samples, coef, trial, res, use = work
     channels = image.shape[2]
@@ -238,10 +241,13 @@ def _try_window(image, flags, row0, col0, size, n_range, law, eps2_c, half, cut,
 
 
 @kernel
-def place_windows(image, flags, edges, n_range, law, eps2_c, sizes, max_window, half, cut, robust, subsets, min_valid, labels):  # type: ignore[no-untyped-def]
+def place_windows(  # type: ignore[no-untyped-def]
+    image, flags, edges, n_range, law, eps2_c, sizes, max_window, half, cut, robust, subsets, min_valid,
+    labels,
+):  # fmt: skip
     """Fill `labels` (H, W) int32 with seeds 1..N; returns N. Windows in raster order, sizes largest first.
 
-    A window is free when the last `size` columns each have a run of `size` rows without edge or seed above them.
+    A window is free when each of its `size` columns ends a run of `size` rows without edge or seed.
     """
     height, width, channels = image.shape
     most = sizes[0] * sizes[0]
@@ -268,7 +274,8 @@ def place_windows(image, flags, edges, n_range, law, eps2_c, sizes, max_window, 
                 col0 = col - size + 1
                 taken = _try_window(
                     image, flags, row0, col0, size, n_range, law, eps2_c, half, cut,
-                    size <= max_window, robust and size <= max_window, subsets, min_valid, work, labels, count + 1,
+                    size <= max_window, robust and size <= max_window, subsets, min_valid, work, labels,
+                    count + 1,
                 )  # fmt: skip
                 if taken > 0:
                     count += 1
@@ -285,7 +292,7 @@ def place_windows(image, flags, edges, n_range, law, eps2_c, sizes, max_window, 
 
 def _fence(edges: NDArray[np.uint8], within: NDArray[np.int32]) -> NDArray[np.uint8]:
     """`edges` plus the upper left side of every border of `within`, and all that lies outside it."""
-    fence = (edges != 0) | (within <= 0)
+    fence: NDArray[np.bool_] = (edges != 0) | (within <= 0)
     fence[:-1] |= within[:-1] != within[1:]
     fence[:, :-1] |= within[:, :-1] != within[:, 1:]
     return fence.astype(np.uint8)
@@ -308,10 +315,11 @@ def initial_partition(
     """
     labels = np.zeros(signals.flags.shape, np.int32)
     blocked = edges if within is None else _fence(edges, within)
-    top = min(config.max_window, *(s - 1 + s % 2 for s in labels.shape))
+    top = min(config.max_window, *(side - 1 + side % 2 for side in signals.flags.shape))
     sizes = np.arange(top, min(config.min_window, top) - 1, -2, dtype=np.int64)
     if config.fit == "auto":
-        sizes = np.concatenate([[w for w in WIDE_WINDOWS_PX if top < w <= min(labels.shape)], sizes]).astype(np.int64)
+        wide = [w for w in WIDE_WINDOWS_PX if top < w <= min(labels.shape)]
+        sizes = np.concatenate([np.array(wide, np.int64), sizes])
     dims = signals.image.shape[2]
     count = place_windows(
         signals.image, signals.flags, blocked, signals.n_range, signals.law, signals.color_eps2, sizes, top,

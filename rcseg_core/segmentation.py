@@ -1,11 +1,10 @@
-"""The result: label images, regions with their Bezier patches, the merge tree, and the image they stand for."""
+"""The result: label images, regions with their Bezier patches, the merge tree, the image they stand for."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +14,7 @@ from rcseg_core.frame import PinholeCamera
 from rcseg_core.grouping import Grouped
 from rcseg_core.hierarchy import Hierarchy, TreeBuilder
 from rcseg_core.models import Models, render
+from rcseg_core.noise import NoiseModel
 from rcseg_core.signals import Signals
 
 
@@ -75,7 +75,7 @@ class Segmentation:
     describe: Callable[[], Sequence[Region]] = field(repr=False)
 
     @property
-    def noise(self):  # type: ignore[no-untyped-def]
+    def noise(self) -> NoiseModel:
         """The NoiseModel of this frame."""
         return self.signals.noise
 
@@ -86,7 +86,7 @@ class Segmentation:
 
     @cached_property
     def hierarchy(self) -> Hierarchy:
-        """The merge tree: seeds to regions (heights up to 1), regions to what a wider limit would join (above 1).
+        """The merge tree: seeds to regions (heights up to 1), regions to what a wider limit joins (above 1).
 
         `nodes` (N + 1,) holds the node of each region.
         """
@@ -115,9 +115,11 @@ class Segmentation:
             For a negative or NaN level.
         """
         if not level >= 0:
-            raise ValueError(f"level = {level}: expected a multiple of the tolerance, 0 or more (1 is the result)")
+            raise ValueError(
+                f"level = {level}: expected a multiple of the tolerance, 0 or more (1 is the result)"
+            )
         if level == 1:
-            return self.labels.copy()
+            return np.array(self.labels)
         if level > 1:
             groups = self.hierarchy.cut(level)[self.nodes][self.labels]
         else:  # within each region: what the colours, and the ranges, join at this level
@@ -169,4 +171,5 @@ def compact(groups: NDArray[np.integer]) -> NDArray[np.int32]:
     order = order[counts[order] > 0]
     number = np.zeros(counts.size, np.int32)
     number[order] = np.arange(1, order.size + 1)
-    return number[groups]
+    labels: NDArray[np.int32] = number[groups]
+    return labels

@@ -38,8 +38,7 @@ class Signals:
     ----------
     image : (H, W, C) float32, C = Cr + 3; channel c is (signal - offset[c]) / scale[c]; 0 where invalid
     cleaned : (H, W, C) float32, image with invalid pixels and impulses replaced by the local median
-    flags : (H, W) uint8 bit mask: 1 invalid, 2 range impulse, 4 colour impulse, 8 misfit (set while
-    segmenting)
+    flags : (H, W) uint8 bit mask: 1 invalid, 2 range impulse, 4 colour impulse, 8 misfit (set later)
     n_range : Cr, 1 for inverse depth, 3 for x, y, z
     scale, offset : (C,) float64
     law : (6,) float64, `local_scales` reads it: variance of the whitened range noise and squared tolerances
@@ -68,7 +67,7 @@ class Signals:
             self,
             image=np.ascontiguousarray(self.image[..., :n]),
             cleaned=self.cleaned[..., :n],
-            flags=self.flags & (INVALID | RANGE_OUTLIER),
+            flags=self.flags & np.uint8(INVALID | RANGE_OUTLIER),
             scale=self.scale[:n],
             offset=self.offset[:n],
         )
@@ -80,7 +79,7 @@ class Signals:
             self,
             image=np.ascontiguousarray(self.image[..., n:]),
             cleaned=self.cleaned[..., n:],
-            flags=self.flags & (INVALID | COLOR_OUTLIER),
+            flags=self.flags & np.uint8(INVALID | COLOR_OUTLIER),
             n_range=0,
             scale=self.scale[n:],
             offset=self.offset[n:],
@@ -89,7 +88,7 @@ class Signals:
 
 @bare
 def local_scales(law, value):  # type: ignore[no-untyped-def]
-    """Variance of the range noise and squared range tolerance, both in sigma^2, at a whitened signal value."""
+    """Variance of the range noise and squared range tolerance, in sigma^2, at a whitened signal value."""
     sigma = law[0] + value * (law[1] + value * law[2])
     if sigma < 0.2:
         sigma = 0.2
@@ -104,9 +103,7 @@ def uses_inverse_depth(frame: RangeColorFrame, config: SegmenterConfig) -> bool:
     return frame.camera is not None and config.signal.kind != "xyz"
 
 
-def build_signals(
-    frame: RangeColorFrame, color: NDArray[np.uint8], config: SegmenterConfig
-) -> Signals:
+def build_signals(frame: RangeColorFrame, color: NDArray[np.uint8], config: SegmenterConfig) -> Signals:
     """Measure the noise, flag impulses and whiten.
 
     Parameters
@@ -131,8 +128,8 @@ def build_signals(
     image, cleaned = np.empty(shape, np.float32), np.empty(shape, np.float32)
     flags = np.empty(valid.shape, np.uint8)
     whiten(
-        raw, median_r, color, median_c, valid, scale, offset, law, config.edges.outlier_threshold, image, cleaned,
-        flags,
+        raw, median_r, color, median_c, valid, scale, offset, law, config.edges.outlier_threshold, image,
+        cleaned, flags,
     )  # fmt: skip
     return Signals(
         image, cleaned, flags, n_range, scale, offset, law, float(np.sum(eps_c**2)) / 3.0,
@@ -181,7 +178,7 @@ def _on_rim_slope(raw, median, row, col, scale, limit):  # type: ignore[no-untyp
 
 @bare
 def _in_company(color, row, col, scale, n_range, limit):  # type: ignore[no-untyped-def]
-    """Whether enough neighbours share the colour of a pixel: a line of two pixels is no impulse, nor its corner."""
+    """Whether enough neighbours share the colour of a pixel: a line of two pixels is no impulse."""
     height, width, channels = color.shape
     alike = 0
     for r in range(max(row - 1, 0), min(row + 2, height)):
@@ -198,9 +195,9 @@ def _in_company(color, row, col, scale, n_range, limit):  # type: ignore[no-unty
 def whiten(raw, median_r, color, median_c, valid, scale, offset, law, threshold, image, cleaned, flags):  # type: ignore[no-untyped-def]
     """Whiten a frame into `image`, flag impulses, and put the local median in their place in `cleaned`.
 
-    raw, median_r : (H, W, Cr) float32; color, median_c : (H, W, 3) uint8; valid : (H, W) bool; scale, offset
-    : (C,) float64; threshold : sigmas from the local median that make an impulse, 0 for none. Out: image,
-    cleaned (H, W, C) float32, flags (H, W) uint8.
+    raw, median_r : (H, W, Cr) float32; color, median_c : (H, W, 3) uint8; valid : (H, W) bool;
+    scale, offset : (C,) float64; threshold : sigmas from the local median that make an impulse, 0 for none.
+    Out: image, cleaned (H, W, C) float32, flags (H, W) uint8.
     """
     height, width, n_range = raw.shape
     limit = threshold * threshold
@@ -220,8 +217,10 @@ def whiten(raw, median_r, color, median_c, valid, scale, offset, law, threshold,
                     image[row, col, c] = 0.0
             else:
                 var, _ = local_scales(law, np.float64(cleaned[row, col, 0]))
-                if threshold > 0.0 and far > limit * var and not _on_rim_slope(
-                    raw, median_r, row, col, scale, limit * var
+                if (
+                    threshold > 0.0
+                    and far > limit * var
+                    and not _on_rim_slope(raw, median_r, row, col, scale, limit * var)
                 ):
                     flag = RANGE_OUTLIER
                 else:

@@ -1,4 +1,4 @@
-"""Composition of the kernels into the passes of the algorithm: measure, generalise, group, for one degree at a time."""
+"""The kernels composed into the passes of the algorithm: measure, generalise, group, one degree at a time."""
 
 from __future__ import annotations
 
@@ -8,13 +8,16 @@ from numpy.typing import NDArray
 from rcseg_core.adjacency import Pairs
 from rcseg_core.config import SegmenterConfig
 from rcseg_core.continuity import continuous_pairs
-from rcseg_core.evidence import KINDS, POINTS, Rule
 from rcseg_core.generalization import choose_degrees, residual_table
 from rcseg_core.grouping import Grouped, add_merged, group
 from rcseg_core.models import Models, fit_models
 from rcseg_core.moments import Moments, plane_exponents, tensor_exponents
 from rcseg_core.partition import Partition
-from rcseg_core.signals import Signals, local_scales
+from rcseg_core.rule import KINDS, POINTS, Rule
+from rcseg_core.signals import INVALID, MISFIT, Signals, local_scales
+
+#: A limit that any pair with a joint model keeps.
+NO_LIMIT = 1e9
 
 
 def make_rule(
@@ -64,7 +67,9 @@ def correlation(signals: Signals) -> tuple[float, float]:
     return signals.noise.range_correlation, signals.noise.color_correlation
 
 
-def tested_degrees(moments: Moments, signals: Signals, highest: int, config: SegmenterConfig) -> NDArray[np.int64]:
+def tested_degrees(
+    moments: Moments, signals: Signals, highest: int, config: SegmenterConfig
+) -> NDArray[np.int64]:
     """(N + 1, 2) the degrees of range and colour that the tests of section 7 support, up to `highest`."""
     start = np.ones((moments.energy.shape[0], 2), np.int64)
     return choose_degrees(
@@ -76,10 +81,10 @@ def tested_degrees(moments: Moments, signals: Signals, highest: int, config: Seg
 def group_pass(
     partition: Partition, signals: Signals, edges: NDArray[np.uint8], degree: int, config: SegmenterConfig
 ) -> Models:
-    """Steps 3-6 at one degree: generalise, then group until the best pair exceeds the limit. Returns the models.
+    """Steps 3-6 at one degree: generalise, then group until the best pair exceeds the limit; the models then.
 
-    With hypothesis "pair" every pair is tried at the degree of the pass, and must earn it where neither side has;
-    with "region" (the paper) each region has the degree that its own tests support.
+    With hypothesis "pair" every pair is tried at the degree of the pass, and must earn it where neither side
+    has; with "region" (the paper) each region has the degree that its own tests support.
     """
     general = config.generalization
     stored = degree if degree == 1 else top_degree(signals, config)  # later passes go on with the same sums
@@ -114,10 +119,41 @@ def curved_regions(moments: Moments, signals: Signals) -> NDArray[np.bool_]:
     return out
 
 
+def absorb_points(partition: Partition, signals: Signals, models: Models, config: SegmenterConfig) -> int:
+    """Step 3: points join the regions that predict them; what hangs together and fits nowhere is a region.
+
+    Returns the number of regions that were added.
+    """
+    partition.absorb(signals, models, config.absorption.max_cost)
+    measured = signals.flags & INVALID == 0
+    return partition.add_leftovers(measured, scaled(config.absorption.min_region, signals.flags))
+
+
+def settle(partition: Partition, signals: Signals, config: SegmenterConfig) -> None:
+    """Specks dissolve into the neighbours that predict them; every measured pixel gets a region."""
+    partition.drop_small(scaled(config.absorption.speck, signals.flags))
+    models = final_models(partition, signals, config)[1]
+    if absorb_points(partition, signals, models, config):
+        models = final_models(partition, signals, config)[1]
+    unpredicted = partition.labels == 0
+    for limit in (1e4, 1e12):  # the order still matters; the limit no longer does
+        partition.absorb(signals, models, limit)
+    signals.flags[unpredicted & (partition.labels > 0)] |= MISFIT
+    if partition.within is None:
+        partition.refine(signals, models, config.absorption.refine_passes)
+    else:  # small parts of `within` that no region reached
+        partition.add_leftovers((partition.within > 0) & (signals.flags & INVALID == 0), 1)
+
+
+def scaled(pixels: int, image: NDArray[np.uint8]) -> int:
+    """An area that is given for 640x480, for the size of this image."""
+    return max(4, round(pixels * image.size / (640 * 480)))
+
+
 def absorb_small(
     partition: Partition, signals: Signals, edges: NDArray[np.uint8], config: SegmenterConfig
 ) -> None:
-    """Step 3 for small regions: absorbed whole, like points, where a larger neighbour predicts or continues them."""
+    """Step 3 for small regions: absorbed whole where a larger one predicts or continues them."""
     moments, degree = final_degrees(partition, signals, config)
     rule = make_rule(signals, degree, config)._replace(kind=POINTS)
     pairs = partition.pairs(edges, config.grouping.max_gap)
@@ -133,6 +169,16 @@ def absorb_small(
     if len(grouped.merges):
         partition.apply(grouped)
         partition.forget()
+
+
+def link_signals(
+    partition: Partition, signals: Signals, edges: NDArray[np.uint8], config: SegmenterConfig
+) -> None:
+    """Regions of colour meet the range again: both decide what small regions and border pixels belong to."""
+    partition.within = None
+    partition.forget()
+    settle(partition, signals, config)
+    absorb_small(partition, signals, edges, config)
 
 
 def top_degree(signals: Signals, config: SegmenterConfig) -> int:
@@ -152,54 +198,23 @@ def final_degrees(
     return moments, tested_degrees(moments, signals, top, config)
 
 
-def final_models(
-    partition: Partition, signals: Signals, config: SegmenterConfig
-) -> tuple[Moments, Models]:
+def final_models(partition: Partition, signals: Signals, config: SegmenterConfig) -> tuple[Moments, Models]:
     """Moments of the current regions and their models at the degrees that the tests of section 7 support."""
     moments, degree = final_degrees(partition, signals, config)
     return moments, fit_models(moments, degree, signals.n_range)
 
 
-def _groups(grouped_count: int, merges: NDArray[np.int64]) -> NDArray[np.int64]:
-    """(N + 1,) lowest label of the group of each region."""
-    parent = np.arange(grouped_count + 1)
-    for keep, gone in merges:
-        parent[gone] = keep
-    for k in range(1, grouped_count + 1):
-        root = k
-        while parent[root] != root:
-            root = parent[root]
-        parent[k] = root
-    lowest = np.full(grouped_count + 1, grouped_count + 1)
-    np.minimum.at(lowest, parent, np.arange(grouped_count + 1))
-    return lowest[parent]
-
-
-def _copy(moments: Moments) -> Moments:
+def copied(moments: Moments) -> Moments:
+    """Moments that grouping may change."""
     return Moments(*(a.copy() for a in moments))
-
-
-def surfaces_of(
-    partition: Partition, signals: Signals, moments: Moments, boxes: NDArray[np.int64], pairs: Pairs,
-    config: SegmenterConfig,
-) -> NDArray[np.int64]:  # fmt: skip
-    """(N + 1,) surface of each region of a joint partition: regions that one range model explains."""
-    degree = np.full((partition.count + 1, 2), config.generalization.max_range_degree, np.int64)
-    rule = make_rule(signals, degree, config, use_color=False)
-    grouped = group(_copy(moments), boxes.copy(), pairs, rule, config.grouping.edge_gate)
-    return _groups(partition.count, grouped.merges)
-
-
-#: A limit that any pair with a joint model keeps.
-NO_LIMIT = 1e9
 
 
 def coarser_merges(
     signals: Signals, moments: Moments, boxes: NDArray[np.int64], pairs: Pairs, config: SegmenterConfig
 ) -> Grouped:
-    """The groupings that would follow if the approximation limit were widened on and on, and what each needs."""
+    """The groupings that would follow if the limit were widened on and on, and the limit that each needs."""
     count = moments.energy.shape[0] - 1
     degree = np.full((count + 1, 2), config.generalization.max_range_degree, np.int64)
     degree[:, 1] = config.generalization.max_color_degree
     rule = make_rule(signals, degree, config)._replace(earn=False)
-    return group(_copy(moments), boxes.copy(), pairs, rule, gated=False, limit=NO_LIMIT)
+    return group(copied(moments), boxes.copy(), pairs, rule, gated=False, limit=NO_LIMIT)
