@@ -1,7 +1,8 @@
 """The Numba decorators of the package: cached, C-like division, no fastmath (NaN marks invalid pixels).
 
-Numba renews a cached kernel when its own file changes, but not when a kernel that it calls, in another file, does: after
-an update the old code would run on. So the cache lies in a folder named after a digest of all sources.
+Numba renews a cached kernel when its own file changes, but not when a kernel that it calls, in another file,
+does: after an update the old code would run on. So the cache lies in a folder named after a digest of all
+sources.
 """
 
 import hashlib
@@ -50,15 +51,15 @@ def compiled(function: F, **options: Any) -> F:
 def cache_folder() -> str:
     """Where the compiled kernels of exactly these sources are kept.
 
-    In NUMBA_CACHE_DIR if that is set, else beside the package, else (read-only installation) in the user's cache
-    folder, else in a temporary one. Folders of earlier sources beside the package are removed.
+    In NUMBA_CACHE_DIR if that is set, else beside the package, else (read-only installation) in the user's
+    cache folder, else in a temporary one. Folders of earlier sources beside the package are removed.
     """
     package = Path(__file__).resolve().parent
     digest = hashlib.sha256()
     for source in sorted(package.glob("*.py")):
         digest.update(source.read_bytes())
     name = f"kernels-{digest.hexdigest()[:16]}"
-    home = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()) / "rcseg"
+    home = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")) / "rcseg"
     named = os.environ.get("NUMBA_CACHE_DIR")
     for parent in [Path(named)] if named else [package / "__pycache__", home]:
         try:

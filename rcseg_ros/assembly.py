@@ -43,7 +43,8 @@ def assemble_frame(
     Raises
     ------
     MessageError
-        Beside those of the decoders: ``no_camera_info``, ``no_color``, ``size_mismatch``, ``camera_mismatch``.
+        Beside those of the decoders: ``no_camera_info``, ``no_color``, ``size_mismatch``,
+        ``camera_mismatch``.
     rcseg_core.errors.InputError
         What the frame itself refuses, such as no valid pixel.
     """

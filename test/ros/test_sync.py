@@ -12,7 +12,7 @@ MS = 1_000_000
 
 
 def feed(sync, events):
-    """Feed ('r' | 'c' | 'k', stamp in ms) in the given order; return the pairs' (range, color) stamps in ms."""
+    """Feed ('r' | 'c' | 'k', stamp in ms) in the given order; return the pairs' (range, color) stamps."""
     add = {"r": sync.add_range, "c": sync.add_color, "k": sync.add_camera}
     pairs = [pair for kind, stamp in events for pair in add[kind](stamp * MS, (kind, stamp))]
     pairs += sync.flush()
