@@ -1,9 +1,9 @@
-"""Parts of one curved surface that no polynomial joins: continuous in position and in slope along their border.
+"""Parts of one curved surface that no polynomial joins: continuous in position and slope along their border.
 
-A quartic follows a hemisphere to 2 % of its radius on the whole, but misses more at the limb, where the surface
-turns away; slivers stay behind there. Where the models of a curved region and of a smaller neighbour agree along
-the border, in position within the tolerance and in orientation, the two are one continuous surface (the aim of
-section 2), and the smaller is taken in. Planes never are: a crease is what parts them.
+A quartic follows a hemisphere to 2 % of its radius on the whole, but misses more at the limb, where the
+surface turns away; slivers stay behind there. Where the models of a curved region and of a smaller neighbour
+agree along the border, in position within the tolerance and in orientation, the two are one continuous
+surface (the aim of section 2), and the smaller is taken in. Planes never are: a crease is what parts them.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from rcseg_core.signals import Signals, local_scales
 MAX_ANGLE_RAD = np.deg2rad(25.0)
 #: Only a neighbour of at most this share of the pixels is taken in.
 MAX_SHARE = 0.5
-#: A sliver is too narrow for its own slope to be known: its border must be free of edges and near in position.
+#: A sliver is too narrow for a slope of its own: its border must be free of edges and near in position.
 MAX_SLIVER_CROSSED, MAX_SLIVER_DISTANCE2 = 0.3, 2.5
 
 
 @bare
 def tangent(models, k, row, col, c):  # type: ignore[no-untyped-def]
-    """Value of range channel c of region k at a pixel and its derivatives along x and y (whitened, per UNIT_PX)."""
+    """Range channel c of region k at a pixel, and its derivatives along x and y (whitened, per UNIT_PX)."""
     degree = models.degree[k, 0]
     x = (col - models.center[k, 0]) / UNIT_PX
     y = (row - models.center[k, 1]) / UNIT_PX
@@ -91,9 +91,9 @@ def continuous_pairs(
 
     Parameters
     ----------
-    sliver_px : smaller neighbours are judged by their position alone
     labels : (H, W) int32; models : fitted to its regions
     curved : (N + 1,) bool, regions whose relief exceeds the tolerance
+    sliver_px : smaller neighbours are judged by their position alone
     """
     count = models.degree.shape[0] - 1
     sizes = np.bincount(labels.ravel(), minlength=count + 1)
