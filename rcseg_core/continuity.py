@@ -24,6 +24,8 @@ MAX_ANGLE_RAD = np.deg2rad(25.0)
 MAX_SHARE = 0.5
 #: A sliver is too narrow for a slope of its own: its border must be free of edges and near in position.
 MAX_SLIVER_CROSSED, MAX_SLIVER_DISTANCE2 = 0.3, 2.5
+#: Pixels for each pixel of common border; the cap of a cylinder is wider.
+MAX_SLIVER_WIDTH_PX = 3.5
 
 
 @bare
@@ -111,7 +113,9 @@ def continuous_pairs(
         with np.errstate(invalid="ignore", divide="ignore"):
             distance2, angle = sums[:, 0] / sums[:, 2], sums[:, 1] / sums[:, 2]
             crossed = pairs.range_crossed[rows] / pairs.boundary[rows]
-        sliver = (sizes[small[rows]] < sliver_px) & (crossed <= MAX_SLIVER_CROSSED)
+            width = sizes[small[rows]] / sums[:, 2]
+        sliver = (sizes[small[rows]] < sliver_px) & (width <= MAX_SLIVER_WIDTH_PX)
+        sliver &= crossed <= MAX_SLIVER_CROSSED
         near = distance2 <= np.where(sliver, MAX_SLIVER_DISTANCE2, 1.0)
         smooth = np.nonzero(near & (sliver | (angle <= MAX_ANGLE_RAD)))[0]
         taken = np.zeros(count + 1, np.bool_)
