@@ -18,7 +18,7 @@ from rcseg_core.errors import ConfigError
 from rcseg_core.frame import RangeColorFrame
 from rcseg_core.jit import bare
 from rcseg_core.moments import UNIT_PX
-from rcseg_core.noise import NoiseModel, estimate_noise
+from rcseg_core.noise import NoiseModel, estimate_noise, typical_values
 
 # Flags of a pixel, a bit mask in `Signals.flags`.
 INVALID, RANGE_OUTLIER, COLOR_OUTLIER = 1, 2, 4
@@ -118,7 +118,7 @@ def build_signals(frame: RangeColorFrame, color: NDArray[np.uint8], config: Segm
     noise = estimate_noise(raw, median_r, valid, color, median_c, inverse, config.noise)
 
     n_range = raw.shape[2]
-    typical = np.median(raw[valid], axis=0).astype(np.float64)
+    typical = typical_values(raw, valid)
     scale = np.concatenate([_typical_sigma(noise, typical), noise.color])
     offset = np.concatenate([typical, np.full(3, 127.0)])
     law = _law(noise, scale[0], typical, inverse, frame, config.grouping.range_tolerance)

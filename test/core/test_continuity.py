@@ -71,9 +71,14 @@ def test_parts_of_about_equal_size_stay_apart():
 
 
 def test_slivers_are_judged_by_position_alone_unless_an_edge_lies_between():
-    kink = np.maximum(COLS - 57.5, 0) * -40.0 / UNIT_PX
-    assert joined(bowl() + kink, split=58) == []
-    assert joined(bowl() + kink, split=58, sliver_px=1000) == [[1, 2]]
+    kink = np.maximum(COLS - 60.5, 0) * -40.0 / UNIT_PX
+    assert joined(bowl() + kink, split=61) == []
+    assert joined(bowl() + kink, split=61, sliver_px=1000) == [[1, 2]]
     edges = np.zeros(SHAPE, np.uint8)
-    edges[:, 58] = 2
-    assert joined(bowl() + kink, split=58, sliver_px=1000, edges=edges) == []
+    edges[:, 61] = 2
+    assert joined(bowl() + kink, split=61, sliver_px=1000, edges=edges) == []
+
+
+def test_the_cap_of_a_cylinder_is_too_wide_for_a_sliver():
+    kink = np.maximum(COLS - 57.5, 0) * -40.0 / UNIT_PX
+    assert joined(bowl() + kink, split=58, sliver_px=1000) == []
