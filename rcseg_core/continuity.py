@@ -22,8 +22,8 @@ from rcseg_core.signals import Signals, local_scales
 MAX_ANGLE_RAD = np.deg2rad(25.0)
 #: Only a neighbour of at most this share of the pixels is taken in.
 MAX_SHARE = 0.5
-#: A sliver is too narrow for a slope of its own: its border must be free of edges and near in position.
-MAX_SLIVER_CROSSED, MAX_SLIVER_DISTANCE2 = 0.3, 2.5
+#: A sliver is too narrow for a sure slope of its own: its border must be free of edges and near in position.
+MAX_SLIVER_CROSSED, MAX_SLIVER_DISTANCE2, MAX_SLIVER_ANGLE_RAD = 0.3, 2.5, np.deg2rad(60.0)
 #: Pixels for each pixel of common border; the cap of a cylinder is wider.
 MAX_SLIVER_WIDTH_PX = 3.5
 
@@ -115,7 +115,7 @@ def continuous_pairs(
             crossed = pairs.range_crossed[rows] / pairs.boundary[rows]
             width = sizes[small[rows]] / sums[:, 2]
         sliver = (sizes[small[rows]] < sliver_px) & (width <= MAX_SLIVER_WIDTH_PX)
-        sliver &= crossed <= MAX_SLIVER_CROSSED
+        sliver &= (crossed <= MAX_SLIVER_CROSSED) & (angle <= MAX_SLIVER_ANGLE_RAD)
         near = distance2 <= np.where(sliver, MAX_SLIVER_DISTANCE2, 1.0)
         smooth = np.nonzero(near & (sliver | (angle <= MAX_ANGLE_RAD)))[0]
         taken = np.zeros(count + 1, np.bool_)

@@ -70,15 +70,17 @@ def test_parts_of_about_equal_size_stay_apart():
     assert joined(bowl(), split=36) == []
 
 
-def test_slivers_are_judged_by_position_alone_unless_an_edge_lies_between():
-    kink = np.maximum(COLS - 60.5, 0) * -40.0 / UNIT_PX
+def test_slivers_may_turn_further_unless_an_edge_lies_between():
+    """At column 61 the bowl rises by 63 degrees; behind the kink by 26, or falls by 68."""
+    kink = np.maximum(COLS - 60.5, 0) * -15.0 / UNIT_PX
     assert joined(bowl() + kink, split=61) == []
     assert joined(bowl() + kink, split=61, sliver_px=1000) == [[1, 2]]
+    assert joined(bowl() + 3.0 * kink, split=61, sliver_px=1000) == []
     edges = np.zeros(SHAPE, np.uint8)
     edges[:, 61] = 2
     assert joined(bowl() + kink, split=61, sliver_px=1000, edges=edges) == []
 
 
 def test_the_cap_of_a_cylinder_is_too_wide_for_a_sliver():
-    kink = np.maximum(COLS - 57.5, 0) * -40.0 / UNIT_PX
+    kink = np.maximum(COLS - 57.5, 0) * -15.0 / UNIT_PX
     assert joined(bowl() + kink, split=58, sliver_px=1000) == []
