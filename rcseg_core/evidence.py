@@ -132,6 +132,16 @@ def _excess(rise, allowance, budget):  # type: ignore[no-untyped-def]
 
 
 @bare
+def _weigh(kind, n_a, n_b, rise_a, rise_b, noise, share, budget_a, budget_b):  # type: ignore[no-untyped-def]
+    """`_excess` of both sides: of their total for CHOW, else the larger of the two, and what it needs."""
+    if kind == CHOW:
+        return _excess(rise_a + rise_b, noise + (n_a + n_b) * share, budget_a + budget_b)
+    ratio_a, need_a = _excess(rise_a, noise + n_a * share, budget_a)
+    ratio_b, need_b = _excess(rise_b, noise + n_b * share, budget_b)
+    return max(ratio_a, ratio_b), max(need_a, need_b)
+
+
+@bare
 def compare_planes(planes, i, j, rule, gate_r, gate_c, shape, signal):  # type: ignore[no-untyped-def]
     """`compare` for three-term planes, from centred moments; shape (6,), signal (C, 5) scratch."""
     joint_shape(planes, i, j, shape)
@@ -158,18 +168,9 @@ def compare_planes(planes, i, j, rule, gate_r, gate_c, shape, signal):  # type: 
         p = 3.0 * (last - first)
         noise = var * rule.correlation[modality] * (p + 4.0 * np.sqrt(2.0 * p))
         share = rule.share2 * var
-        if rule.kind == CHOW:
-            n = n_i + n_j
-            ratio, need = _excess(rise_i + rise_j, noise + n * share, n * eps2)
-            value = max(value, ratio)
-            height = max(height, need)
-        else:
-            ratio, need = _excess(rise_i, noise + n_i * share, n_i * eps2)
-            value = max(value, ratio)
-            height = max(height, need)
-            ratio, need = _excess(rise_j, noise + n_j * share, n_j * eps2)
-            value = max(value, ratio)
-            height = max(height, need)
+        ratio, need = _weigh(rule.kind, n_i, n_j, rise_i, rise_j, noise, share, n_i * eps2, n_j * eps2)
+        value = max(value, ratio)
+        height = max(height, need)
     return value, height, value <= 1.0
 
 
@@ -207,18 +208,11 @@ def _bounded(moments, big, small, rule, own, gate_r, gate_c, work):  # type: ign
             noise2 = var * rule.n_range
             budget_big = n_big * earned_tolerance(eps2, rule.relief2, n_big, own[big], noise2)
             budget_small = n_small * earned_tolerance(eps2, rule.relief2, n_small, own[small], noise2)
-        if rule.kind == CHOW:
-            n = n_big + n_small
-            ratio, need = _excess(rise_big + rise_small, noise + n * share, budget_big + budget_small)
-            value = max(value, ratio)
-            height = max(height, need)
-        else:
-            ratio, need = _excess(rise_big, noise + n_big * share, budget_big)
-            value = max(value, ratio)
-            height = max(height, need)
-            ratio, need = _excess(rise_small, noise + n_small * share, budget_small)
-            value = max(value, ratio)
-            height = max(height, need)
+        ratio, need = _weigh(
+            rule.kind, n_big, n_small, rise_big, rise_small, noise, share, budget_big, budget_small
+        )
+        value = max(value, ratio)
+        height = max(height, need)
     return value, height
 
 

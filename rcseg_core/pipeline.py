@@ -121,7 +121,7 @@ def partition_by(
     for round_ in range(MAX_ROUNDS):
         before = partition.count
         for degree in higher:
-            models = group_pass(partition, signals, edges, degree, config)
+            group_pass(partition, signals, edges, degree, config)
         clock.lap(f"{name} generalize")
         if not config.absorption.enabled:
             break
