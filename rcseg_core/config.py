@@ -19,6 +19,13 @@ from rcseg_core.errors import ConfigError
 #: What YAML and shells write for a boolean.
 TRUE_WORDS, FALSE_WORDS = ("true", "yes", "on", "1"), ("false", "no", "off", "0")
 
+#: What each preset changes; "balanced" is the default itself.
+PRESETS: Mapping[str, Mapping[str, Any]] = {
+    "fast": {"grouping.order": "joint"},
+    "balanced": {},
+    "accurate": {"absorption.refine_passes": 4},
+}
+
 
 @dataclass(frozen=True)
 class Parameter:
@@ -265,13 +272,26 @@ class SegmenterConfig:
             )
 
     @classmethod
-    def from_dict(cls, nested: Mapping[str, Any]) -> SegmenterConfig:
-        """Defaults overridden by a nested mapping {group: {name: value}}; unknown keys are errors.
+    def preset(cls, name: str) -> SegmenterConfig:
+        """A named trade of accuracy for time: "fast", "balanced" (the defaults) or "accurate".
 
         Raises
         ------
         ConfigError
-            Naming the key, the value and what is allowed.
+            For another name; the message lists the names.
+        """
+        if not isinstance(name, str) or name not in PRESETS:
+            raise ConfigError(f"preset = {name!r}: expected one of {', '.join(PRESETS)}")
+        return cls().replace(PRESETS[name])
+
+    @classmethod
+    def from_dict(cls, nested: Mapping[str, Any], base: SegmenterConfig | None = None) -> SegmenterConfig:
+        """`base` (the defaults if None) overridden by a nested mapping {group: {name: value}}.
+
+        Raises
+        ------
+        ConfigError
+            Unknown key, wrong type or value out of bounds; names the key, the value and what is allowed.
         """
         flat: dict[str, Any] = {}
         if not isinstance(nested, Mapping):
@@ -281,7 +301,7 @@ class SegmenterConfig:
                 raise ConfigError(f"{group}: expected a mapping of parameters, got {values!r}")
             for name, value in values.items():
                 flat[f"{group}.{name}"] = value
-        return cls().replace(flat)
+        return (base or cls()).replace(flat)
 
     def replace(self, changes: Mapping[str, Any]) -> SegmenterConfig:
         """A copy with some dotted keys changed, for example ``{"grouping.range_tolerance": 0.004}``.

@@ -6,6 +6,7 @@ readable. Heavy modules are imported inside the commands, so that --help and com
 
 import sys
 from collections.abc import Sequence
+from enum import Enum
 from pathlib import Path
 from typing import Annotated, Any, Optional
 
@@ -22,10 +23,23 @@ app = typer.Typer(
 
 INTERRUPTED = 130
 
+
+class Preset(str, Enum):
+    """Names of `rcseg_core.config.PRESETS`, written here again so that completion needs no import of it."""
+
+    fast = "fast"
+    balanced = "balanced"
+    accurate = "accurate"
+
+
 # Typer 0.9 (Ubuntu 24.04) reads neither "X | None" nor annotations that are postponed.
 ConfigFile = Annotated[
     Optional[Path],  # noqa: UP045
     typer.Option("--config", "-c", help="YAML file of parameters (`rcseg config --yaml` writes one)."),
+]
+Presets = Annotated[
+    Optional[Preset],  # noqa: UP045
+    typer.Option("--preset", "-p", help="Speed against accuracy (balanced); --config and --set change it."),
 ]
 Settings = Annotated[
     Optional[list[str]],  # noqa: UP045
@@ -42,6 +56,7 @@ Output = Annotated[
 def replay(
     bag: Annotated[Path, typer.Argument(help=".mcap file or rosbag2 folder.", show_default=False)],
     output: Output = None,
+    preset: Presets = None,
     config: ConfigFile = None,
     set_: Settings = None,
     topics: Annotated[
@@ -67,7 +82,7 @@ def replay(
     request = ReplayRequest(
         bag=bag,
         output=output or Path(f"{bag.absolute().stem}_rcseg"),
-        config=load_config(config, set_ or ()),
+        config=load_config(config, set_ or (), preset),
         topics=_parse_topics(topics or ()),
         range_from=_choice("--range-from", range_from, ("auto", "points", "depth")),
         slop_ns=round(slop * 1e6),
@@ -94,6 +109,7 @@ def segment(
     intrinsics: Annotated[str, typer.Option(metavar="FX,FY,CX,CY", help="Camera, in pixels.")] = "",
     depth_unit: Annotated[float, typer.Option(min=1e-6, help="Metres of one step of depth.")] = 0.001,
     output: Output = None,
+    preset: Presets = None,
     config: ConfigFile = None,
     set_: Settings = None,
     force: Force = False,
@@ -103,7 +119,7 @@ def segment(
     from rcseg_ros.settings import load_config
     from rcseg_ros.terminal import prepare, print_regions
 
-    settings = load_config(config, set_ or ())
+    settings = load_config(config, set_ or (), preset)
     if frame is not None and color is None and depth is None:
         data, name = read_npz(frame), frame.stem
     elif frame is None and color is not None and depth is not None and intrinsics:
@@ -123,6 +139,7 @@ def config(
         Optional[Path],  # noqa: UP045
         typer.Option(help="Write the parameters to this file instead; - for the screen."),
     ] = None,
+    preset: Presets = None,
     config_file: ConfigFile = None,
     set_: Settings = None,
     force: Annotated[bool, typer.Option("--force", "-f", help="Overwrite the file.")] = False,
@@ -131,7 +148,7 @@ def config(
     from rcseg_ros.settings import config_yaml, load_config
     from rcseg_ros.terminal import print_config
 
-    settings = load_config(config_file, set_ or ())
+    settings = load_config(config_file, set_ or (), preset)
     if yaml is None:
         print_config(settings)
     elif str(yaml) == "-":
@@ -157,6 +174,7 @@ def evaluate(
         Optional[Path],  # noqa: UP045
         typer.Option("--output", "-o", help="Folder to write; by default NAME_evaluation in this folder."),
     ] = None,
+    preset: Presets = None,
     config: ConfigFile = None,
     set_: Settings = None,
     families: Annotated[str, typer.Option(help="Synthetic families, separated by commas.")] = "all",
@@ -179,7 +197,7 @@ def evaluate(
     from rcseg_ros.settings import load_config
     from rcseg_ros.terminal import CONSOLE, prepare
 
-    settings = load_config(config, set_ or ())
+    settings = load_config(config, set_ or (), preset)
     folder = output or Path(f"{Path(dataset).absolute().stem}_evaluation")
     scenes = SyntheticOptions(
         parse_families(families, structured_light=structured_light),
@@ -232,6 +250,7 @@ def bench(
         Optional[Path],  # noqa: UP045
         typer.Option("--output", "-o", help="Folder for bench.json, bench.csv and plots; without it none."),
     ] = None,
+    preset: Presets = None,
     config: ConfigFile = None,
     set_: Settings = None,
     force: Force = False,
@@ -254,7 +273,7 @@ def bench(
         probe=probe or cold,
         cold=cold,
     )
-    run_bench(options, load_config(config, set_ or ()), output, force)
+    run_bench(options, load_config(config, set_ or (), preset), output, force)
 
 
 @app.command(epilog="Example: `rcseg inspect demo --frame 0`")
@@ -292,6 +311,7 @@ def view(
     ] = 2.0,
     once: Annotated[bool, typer.Option("--once", help="Do not begin again at the end.")] = False,
     node: Annotated[str, typer.Option(help="Name of the node, where its topics lie.")] = "/rcseg",
+    preset: Presets = None,
     config: ConfigFile = None,
     set_: Settings = None,
 ) -> None:
@@ -300,7 +320,7 @@ def view(
     from rcseg_ros.terminal import run_view
     from rcseg_ros.view import ViewRequest
 
-    request = ViewRequest(bag, load_config(config, set_ or ()), node, rate, loop=not once)
+    request = ViewRequest(bag, load_config(config, set_ or (), preset), node, rate, loop=not once)
     raise typer.Exit(run_view(request, host, port, foxglove))
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 from rcseg_core import SegmenterConfig
-from rcseg_core.config import Parameter, describe
+from rcseg_core.config import PRESETS, Parameter, describe
 
 
 def _option(
@@ -20,6 +20,10 @@ def _option(
 
 NODE_PARAMETERS = (
     _option("autostart", True, "configure and activate at start, without a lifecycle manager"),
+    _option(
+        "preset", "balanced", "of the algorithm's parameters below, where no file or override names them",
+        choices=tuple(PRESETS),
+    ),
     _option(
         "input.range_from", "auto", "points: PointCloud2; depth: Image (REP 118); auto: what arrives first",
         choices=("auto", "points", "depth"),
@@ -56,7 +60,7 @@ NODE_PARAMETERS = (
 
 # Taken over between two frames; the others build subscriptions and are read at configure.
 LIVE_NODE_PARAMETERS = frozenset({"input.queue", "diagnostics.warn_period_s"})
-READ_ONLY = frozenset({"autostart"})
+READ_ONLY = frozenset({"autostart", "preset"})
 
 
 def all_parameters(config: SegmenterConfig | None = None) -> list[Parameter]:
@@ -77,6 +81,7 @@ def default_yaml() -> str:
     lines = [
         "# Every parameter of the node rcseg at its default, written by `python -m rcseg_ros.options`.",
         "# Copy what you change; a file need not be complete. Bounds, units and text: `rcseg config`.",
+        "# This one, being complete, leaves nothing to a preset: take fast.yaml or accurate.yaml for those.",
         "/**:",
         "  ros__parameters:",
     ]

@@ -7,6 +7,7 @@ is refused with its words.
 
 from __future__ import annotations
 
+import dataclasses
 import difflib
 from collections.abc import Callable
 from typing import Any
@@ -40,8 +41,10 @@ class NodeParameters:
     def __init__(self, node: Node, is_unconfigured: Callable[[], bool]) -> None:
         self._node = node
         self._is_unconfigured = is_unconfigured
-        for parameter in all_parameters():
+        for parameter in NODE_PARAMETERS:
             _declare(node, parameter)
+        for parameter in describe(SegmenterConfig.preset(self["preset"])):
+            _declare(node, dataclasses.replace(parameter, default=parameter.value))  # overrides go before it
         reason = self._refusal({p.key: self[p.key] for p in NODE_PARAMETERS})
         if reason:
             raise ConfigError(reason)

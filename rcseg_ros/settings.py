@@ -14,21 +14,29 @@ from rcseg_core.config import Parameter, describe
 from rcseg_core.errors import ConfigError, InputError
 
 
-def load_config(path: Path | None, settings: Sequence[str]) -> SegmenterConfig:
-    """Defaults, changed by a YAML file, changed by ``group.name=value`` settings.
+def load_config(path: Path | None, settings: Sequence[str], preset: str | None = None) -> SegmenterConfig:
+    """A preset, changed by a YAML file, changed by ``group.name=value`` settings.
 
-    The file is what `rcseg config --yaml` writes, or a ROS parameter file, other groups left out.
+    The file is what `rcseg config --yaml` writes, or a ROS parameter file, the node's own groups left out. A
+    file that names every parameter leaves nothing of the preset.
+
+    Parameters
+    ----------
+    preset : name of a preset; None: the one that a ROS parameter file names, else the defaults
 
     Raises
     ------
     InputError
         If the file cannot be read as YAML.
     ConfigError
-        Unknown parameter, wrong type or value out of bounds.
+        Unknown preset or parameter, wrong type or value out of bounds.
     """
-    nested = {} if path is None else _read(path)
+    nested, named = ({}, None) if path is None else _read(path)
+    base = SegmenterConfig.preset(preset or "balanced")
     try:
-        config = SegmenterConfig.from_dict(nested)
+        if preset is None and named is not None:
+            base = SegmenterConfig.preset(named)
+        config = SegmenterConfig.from_dict(nested, base)
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
     changes = {}
@@ -40,7 +48,8 @@ def load_config(path: Path | None, settings: Sequence[str]) -> SegmenterConfig:
     return config.replace(changes)
 
 
-def _read(path: Path) -> dict[str, Any]:
+def _read(path: Path) -> tuple[dict[str, Any], Any]:
+    """Groups of a file, and the preset that it names or None."""
     try:
         nested = yaml.safe_load(path.read_text("utf-8"))
     except OSError as error:
@@ -48,7 +57,7 @@ def _read(path: Path) -> dict[str, Any]:
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: not a YAML file: {' '.join(str(error).split())}") from None
     if nested is None:
-        return {}
+        return {}, None
     if not isinstance(nested, dict):
         raise ConfigError(f"{path}: a configuration is a mapping of groups, got {type(nested).__name__}")
     ros = [
@@ -57,9 +66,10 @@ def _read(path: Path) -> dict[str, Any]:
         if isinstance(node, dict) and "ros__parameters" in node
     ]
     if not ros:
-        return nested
+        return nested, None
+    given = {key: value for node in ros for key, value in node.items()}
     groups = {field.name for field in fields(SegmenterConfig)}
-    return {key: value for node in ros for key, value in node.items() if key in groups}
+    return {key: value for key, value in given.items() if key in groups}, given.get("preset")
 
 
 def config_yaml(config: SegmenterConfig) -> str:

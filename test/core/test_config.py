@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rcseg_core import ConfigError, RcsegError, SegmenterConfig
-from rcseg_core.config import GroupingConfig, SeedsConfig, describe
+from rcseg_core.config import PRESETS, GroupingConfig, SeedsConfig, describe
 
 PARAMETERS = {p.key: p for p in describe(SegmenterConfig())}
 NUMBERS = [key for key, p in PARAMETERS.items() if p.type in (int, float)]
@@ -211,6 +211,29 @@ def test_the_literal_form_departs_wherever_there_is_a_switch():
     assert literal.generalization.test == "f"
     assert literal.generalization.alpha == 0.1
     assert literal.seeds.max_window == 11 and literal.seeds.min_window == 3
+
+
+def test_presets_are_the_default_and_what_their_table_changes():
+    assert list(PRESETS) == ["fast", "balanced", "accurate"]
+    assert SegmenterConfig.preset("balanced") == SegmenterConfig()
+    for name, changes in PRESETS.items():
+        values = {p.key: p.value for p in describe(SegmenterConfig.preset(name))}
+        differing = {key: value for key, value in values.items() if value != PARAMETERS[key].default}
+        assert differing == dict(changes), f"{name}: a change that changes nothing, or one too many"
+    assert SegmenterConfig.preset("fast") != SegmenterConfig.preset("accurate")
+
+
+@pytest.mark.parametrize("name", ["quick", "Fast", "", None, ["fast"]])
+def test_an_unknown_preset_is_refused_with_the_names_of_all(name):
+    with pytest.raises(ConfigError, match="expected one of fast, balanced, accurate") as error:
+        SegmenterConfig.preset(name)
+    assert repr(name) in str(error.value)
+
+
+def test_a_mapping_goes_over_its_base():
+    base = SegmenterConfig.preset("fast")
+    config = SegmenterConfig.from_dict({"grouping": {"max_gap": 2}}, base)
+    assert config == base.replace({"grouping.max_gap": 2})
 
 
 def test_errors_are_one_family():

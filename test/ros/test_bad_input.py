@@ -241,6 +241,13 @@ def test_parameters(refused, recording, command, setting, message):
     assert message in refused(*where, "--set", setting)
 
 
+@pytest.mark.parametrize("command", ["replay", "config"])
+def test_presets(refused, recording, command):
+    where = ["config"] if command == "config" else ["replay", recording(depth_entries(1))]
+    text = refused(*where, "--preset", "quick")
+    assert "quick" in text and all(name in text for name in ("fast", "balanced", "accurate"))
+
+
 def test_parameter_files(refused, tmp_path):
     file = tmp_path / "my.yaml"
     for text, message in {

@@ -12,10 +12,11 @@ import yaml
 from recordings import CAMERA, depth_entries, scene, write_folder
 
 from rcseg_core import SegmenterConfig, segment
-from rcseg_core.config import describe
-from rcseg_ros.cli import main
+from rcseg_core.config import PRESETS, describe
+from rcseg_ros.cli import Preset, main
 
-BAGS = Path(__file__).resolve().parents[2] / "bags"
+ROOT = Path(__file__).resolve().parents[2]
+BAGS = ROOT / "bags"
 
 
 @pytest.fixture
@@ -100,6 +101,34 @@ def test_config_shows_every_parameter_and_returns_from_its_own_file(rcseg, tmp_p
     rcseg("config", *settings, "--yaml", "my.yaml")
     assert SegmenterConfig.from_dict(yaml.safe_load((tmp_path / "my.yaml").read_text())) == changed
     assert rcseg("config", "--config", "my.yaml", "--yaml", "-") == (tmp_path / "my.yaml").read_text()
+
+
+def printed(rcseg, *arguments):
+    return SegmenterConfig.from_dict(yaml.safe_load(rcseg("config", *arguments, "--yaml", "-")))
+
+
+def test_a_preset_lies_below_the_file_and_the_file_below_single_settings(rcseg, tmp_path):
+    fast = SegmenterConfig.preset("fast")
+    assert printed(rcseg, "--preset", "fast") == fast != SegmenterConfig()
+    (tmp_path / "my.yaml").write_text("grouping: {max_gap: 2, range_tolerance: 0.01}")
+    expected = fast.replace({"grouping.range_tolerance": 0.01, "grouping.max_gap": 5})
+    given = ("--set", "grouping.max_gap=5", "-c", "my.yaml", "-p", "fast")
+    assert printed(rcseg, *given) == expected
+
+
+def test_a_ros_file_may_name_the_preset_and_the_option_goes_before_it(rcseg, tmp_path):
+    file = ROOT / "config" / "fast.yaml"
+    assert printed(rcseg, "-c", file) == SegmenterConfig.preset("fast")
+    assert printed(rcseg, "-c", file, "-p", "accurate") == SegmenterConfig.preset("accurate")
+
+
+def test_completion_knows_the_presets():
+    assert [preset.value for preset in Preset] == list(PRESETS)
+
+
+@pytest.mark.parametrize("command", ["replay", "segment", "evaluate", "bench", "view", "config"])
+def test_commands_that_segment_take_a_preset(rcseg, command):
+    assert "--preset" in rcseg(command, "--help")
 
 
 def test_a_ros_parameter_file_is_a_configuration_too(rcseg, tmp_path):

@@ -139,6 +139,7 @@ def test_signal_while_unconfigured(run):
             {"qos.reliability": "perhaps"},
             "qos.reliability = 'perhaps': expected one of auto, reliable, best_effort",
         ),
+        ({"preset": "quick"}, "preset = 'quick': expected one of fast, balanced, accurate"),
         ({"seeds.min_window": 13}, "seeds.min_window = 13 is larger than seeds.max_window = 11"),
     ],
 )

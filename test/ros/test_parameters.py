@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from rcseg_core import SegmenterConfig
-from rcseg_core.config import describe
+from rcseg_core.config import PRESETS, describe
 from rcseg_ros.options import NODE_PARAMETERS, all_parameters, default_yaml
 
 ROOT = Path(__file__).parents[2]
@@ -66,7 +66,7 @@ def test_every_parameter_is_declared_with_its_descriptor(live, peer):
         assert descriptor.name == parameter.key
         assert descriptor.description.startswith(parameter.doc)
         assert parameter.unit in descriptor.description
-        assert descriptor.read_only == (parameter.key == "autostart")
+        assert descriptor.read_only == (parameter.key in ("autostart", "preset"))
         ranges = [*descriptor.integer_range, *descriptor.floating_point_range]
         if parameter.type in (int, float):
             assert (ranges[0].from_value, ranges[0].to_value) == (parameter.low, parameter.high)
@@ -107,6 +107,7 @@ def test_a_change_takes_effect_with_the_next_frame(live, peer):
         ({"qos__depth": 7}, "read at configure"),
         ({"sync__slop_ms": 7.0}, "read at configure"),
         ({"autostart": False}, "read-only"),
+        ({"preset": "fast"}, "read-only"),
     ],
 )
 def test_refusals_give_the_reason_and_change_nothing(peer, changes, words):
@@ -115,6 +116,19 @@ def test_refusals_give_the_reason_and_change_nothing(peer, changes, words):
     (result,) = peer.set_parameters(**changes)
     assert not result.successful and words in result.reason
     assert peer.get_parameters(*names) == before
+
+
+def test_a_preset_fills_in_what_was_not_given(live, run):
+    """At start: parameters that are given go before the preset, the preset before the defaults."""
+    from rclpy.parameter import parameter_value_to_python
+
+    key, value = next(iter(PRESETS["accurate"].items()))
+    values = {p.key: p.value for p in describe(SegmenterConfig.preset("accurate"))}
+    _, peer = run("preset", {"preset": "accurate", "grouping.max_gap": 2, "autostart": False}, active=False)
+    expected = {**values, "grouping.max_gap": 2}
+    found = [parameter_value_to_python(v) for v in peer.get_parameters(*expected)]
+    assert dict(zip(expected, found, strict=True)) == expected and expected[key] == value
+    assert peer.set_parameters(grouping__max_gap=4)[0].successful, "a preset fixes nothing"
 
 
 def test_whole_groups_are_taken_or_refused_together(live, peer):
