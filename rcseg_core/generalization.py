@@ -12,35 +12,67 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import f as f_distribution
+from scipy.special import fdtrc
 
 from rcseg_core.config import GeneralizationConfig
-from rcseg_core.jit import kernel
-from rcseg_core.moments import Moments, residual, solve, tensor_exponents
+from rcseg_core.jit import bare
+from rcseg_core.moments import PIVOT_TOLERANCE, Moments, tensor_exponents
 
 #: A model needs this many pixels a coefficient, or it follows the noise.
 PIXELS_PER_COEFFICIENT = 8
 
 
-@kernel
-def residual_table(moments, n_range, terms, out):  # type: ignore[no-untyped-def]
-    """out[k, modality, degree - 1]: residual sum of squares of region k for each degree."""
+@bare
+def residual_table(moments, n_range, exponents, gram, work, out):  # type: ignore[no-untyped-def]
+    """out[k, modality, degree - 1]: residual sum of squares of region k for each degree, eq. (14).
+
+    exponents : (p, 2), the terms of the highest degree, those of each lower degree first (`nested_exponents`);
+    gram : (p + 1, p), work : (p,) scratch. With R = L L^T in that order, z = L^-1 v gives the residual of all
+    degrees at once: T T^T - z_0^2 - ... up to the last term of the degree.
+    """
     channels = moments.energy.shape[1]
-    low = moments.cross.shape[2]
-    gram = np.empty((low * low + 1, low * low))
-    coef = np.empty((channels, low * low))
+    p = exponents.shape[0]
+    scale = gram[p]
     for k in range(1, moments.energy.shape[0]):
-        for degree in range(1, len(terms)):
-            if degree >= low:
-                continue
-            t = terms[degree]
-            for modality in range(2):
-                first = 0 if modality == 0 else n_range
-                last = n_range if modality == 0 else channels
-                solve(moments.power[k], moments.cross[k], first, last, t, gram, coef)
-                out[k, modality, degree - 1] = residual(
-                    moments.power[k], moments.cross[k], moments.energy[k], first, last, t, coef
-                )
+        power = moments.power[k]
+        for i in range(p):
+            d = power[2 * exponents[i, 0], 2 * exponents[i, 1]]
+            scale[i] = 1.0 / np.sqrt(d) if d > 0.0 else 0.0
+        for i in range(p):
+            for j in range(i + 1):
+                total = power[exponents[i, 0] + exponents[j, 0], exponents[i, 1] + exponents[j, 1]]
+                total *= scale[i] * scale[j]
+                for m in range(j):
+                    total -= gram[i, m] * gram[j, m]
+                if i == j:
+                    gram[i, i] = np.sqrt(total) if total > PIVOT_TOLERANCE else 0.0
+                else:
+                    gram[i, j] = total / gram[j, j] if gram[j, j] > 0.0 else 0.0
+        for c in range(channels):
+            rss = moments.energy[k, c]
+            for i in range(p):
+                total = moments.cross[k, c, exponents[i, 0], exponents[i, 1]] * scale[i]
+                for m in range(i):
+                    total -= gram[i, m] * work[m]
+                work[i] = total / gram[i, i] if gram[i, i] > 0.0 else 0.0
+                rss -= work[i] * work[i]
+                degree = max(exponents[i, 0], exponents[i, 1])
+                if degree > 0 and i + 1 == (degree + 1) * (degree + 1):
+                    out[k, 0 if c < n_range else 1, degree - 1] += max(rss, 0.0)
+
+
+def nested_exponents(degree: int) -> NDArray[np.int64]:
+    """`tensor_exponents` with the terms of each lower degree first."""
+    terms = tensor_exponents(degree)
+    return terms[np.lexsort((terms[:, 1], terms[:, 0], terms.max(axis=1)))]
+
+
+def residuals_by_degree(moments: Moments, n_range: int, highest: int) -> NDArray[np.float64]:
+    """(N + 1, 2, highest) residual sums of squares of each region, for range and colour, degrees 1 to highest."""
+    terms = nested_exponents(min(highest, moments.cross.shape[2] - 1))
+    out = np.zeros((moments.energy.shape[0], 2, highest))
+    residual_table(moments, n_range, terms, np.empty((len(terms) + 1, len(terms))), np.empty(len(terms)), out)
+    return out
 
 
 def f_test(
@@ -52,7 +84,7 @@ def f_test(
     with np.errstate(divide="ignore", invalid="ignore"):
         statistic = (rss_low / rss_high - 1.0) * dof / q  # eq. (22)
     statistic = np.where(rss_high > 0, statistic, np.where(rss_low > 0, np.inf, 0.0))
-    p_value = f_distribution.sf(statistic, q, np.maximum(dof, 1))
+    p_value = fdtrc(q, np.maximum(dof, 1), np.maximum(statistic, 0.0))
     return np.where(dof > 0, p_value, 1.0)
 
 
@@ -75,16 +107,15 @@ def choose_degrees(
     (N + 1, 2) int64
     """
     channels = moments.energy.shape[1]
-    terms = tuple(tensor_exponents(k) for k in range(5))
-    table = np.zeros((moments.energy.shape[0], 2, 4))
-    residual_table(moments, n_range, terms, table)
+    reached = min(highest, moments.cross.shape[2] - 1)
+    table = residuals_by_degree(moments, n_range, max(reached, 1))
     degree: NDArray[np.int64] = start.copy()
     n = moments.count
     index = np.arange(n.size)
     tops = (min(config.max_range_degree, highest), min(config.max_color_degree, highest))
     widths = (n_range, channels - n_range)
     for modality, (width, top) in enumerate(zip(widths, tops, strict=True)):
-        for high in range(2, min(top, moments.cross.shape[2] - 1) + 1):
+        for high in range(2, min(top, reached) + 1):
             for low in range(1, high):
                 rss_low, rss_high = table[:, modality, low - 1], table[:, modality, high - 1]
                 independent = n / correlation[modality]

@@ -96,6 +96,21 @@ def local_scales(law, value):  # type: ignore[no-untyped-def]
     return sigma * sigma, eps * eps
 
 
+def scales(
+    law: NDArray[np.float64], values: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """`local_scales` of an array."""
+    variance, tolerance2 = np.empty_like(values), np.empty_like(values)
+    _scales(law, values, variance, tolerance2)
+    return variance, tolerance2
+
+
+@bare
+def _scales(law, values, variance, tolerance2):  # type: ignore[no-untyped-def]
+    for k in range(values.size):
+        variance[k], tolerance2[k] = local_scales(law, values[k])
+
+
 def uses_inverse_depth(frame: RangeColorFrame, config: SegmenterConfig) -> bool:
     """Which range signal is modelled; a camera is needed for inverse depth."""
     if config.signal.kind == "inverse_depth" and frame.camera is None:

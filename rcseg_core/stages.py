@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 from rcseg_core.adjacency import Pairs
 from rcseg_core.config import SegmenterConfig
 from rcseg_core.continuity import continuous_pairs
-from rcseg_core.generalization import choose_degrees, residual_table
+from rcseg_core.generalization import choose_degrees, residuals_by_degree
 from rcseg_core.grouping import Grouped, add_merged, group
 from rcseg_core.models import Models, fit_models
 from rcseg_core.moments import Moments, plane_exponents, tensor_exponents
 from rcseg_core.partition import Partition
 from rcseg_core.rule import KINDS, POINTS, Rule
-from rcseg_core.signals import INVALID, MISFIT, Signals, local_scales
+from rcseg_core.signals import INVALID, MISFIT, Signals, scales
 
 #: A limit that any pair with a joint model keeps.
 NO_LIMIT = 1e9
@@ -54,11 +54,8 @@ def make_rule(
 
 def noise_variance(moments: Moments, signals: Signals) -> NDArray[np.float64]:
     """(N + 1, 2) variance of one pixel's noise in whitened units at the mean signal of each region."""
-    count = np.maximum(moments.count, 1.0)
-    mean = moments.cross[:, 0, 0, 0] / count
-    out = np.ones((count.size, 2))
-    for k in range(1, count.size):
-        out[k, 0] = local_scales(signals.law, mean[k])[0]
+    out = np.ones((moments.count.size, 2))
+    out[:, 0] = scales(signals.law, moments.cross[:, 0, 0, 0] / np.maximum(moments.count, 1.0))[0]
     return out
 
 
@@ -109,14 +106,12 @@ def group_pass(
 
 def curved_regions(moments: Moments, signals: Signals) -> NDArray[np.bool_]:
     """(N + 1,) regions that a first-degree model misses by more than the tolerance."""
-    flat = np.zeros((moments.energy.shape[0], 2, 4))
-    residual_table(moments, signals.n_range, (tensor_exponents(0), tensor_exponents(1)), flat)
+    flat = residuals_by_degree(moments, signals.n_range, 1)[:, 0, 0]
     count = np.maximum(moments.count, 1.0)
-    out = np.zeros(count.size, np.bool_)
-    for k in range(1, count.size):
-        var, eps2 = local_scales(signals.law, moments.cross[k, 0, 0, 0] / count[k])
-        out[k] = flat[k, 0, 0] / count[k] > signals.n_range * var + eps2
-    return out
+    var, eps2 = scales(signals.law, moments.cross[:, 0, 0, 0] / count)
+    curved: NDArray[np.bool_] = flat / count > signals.n_range * var + eps2
+    curved[0] = False
+    return curved
 
 
 def absorb_points(partition: Partition, signals: Signals, models: Models, config: SegmenterConfig) -> int:
