@@ -66,12 +66,28 @@ def _bucket(models, k, image, flags, row, col, n_range, law, color_eps2, max_cos
 
 
 @bare
+def _count(labels, flags, total):  # type: ignore[no-untyped-def]
+    for row in range(labels.shape[0]):
+        for col in range(labels.shape[1]):
+            total[0] += (labels[row, col] == 0) & (flags[row, col] & INVALID == 0)
+
+
+def count_unassigned(labels: NDArray[np.int32], flags: NDArray[np.uint8]) -> int:
+    """Measured pixels without a region."""
+    total = np.zeros(1, np.int64)
+    _count(labels, flags, total)
+    return int(total[0])
+
+
+@bare
 def _grow(image, flags, labels, leaves, within, models, n_range, law, color_eps2, max_cost, offers):  # type: ignore[no-untyped-def]
     """Best-first growth: unassigned pixels get an offer of each region they touch; the cheapest comes first.
 
+    within : (H, W) int32, or (1, 1) for no bounds
     Returns the number of pixels that were absorbed.
     """
     height, width = labels.shape
+    bounded = within.shape[0] == height
     absorbed = 0
     used = 0
     for row in range(height):
@@ -83,7 +99,7 @@ def _grow(image, flags, labels, leaves, within, models, n_range, law, color_eps2
                 c = col + (d == 3) - (d == 2)
                 if r < 0 or c < 0 or r >= height or c >= width:
                     continue
-                if labels[r, c] == 0 or within[r, c] != within[row, col]:
+                if labels[r, c] == 0 or (bounded and within[r, c] != within[row, col]):
                     continue
                 k = labels[r, c]
                 bucket = _bucket(models, k, image, flags, row, col, n_range, law, color_eps2, max_cost)
@@ -111,7 +127,9 @@ def _grow(image, flags, labels, leaves, within, models, n_range, law, color_eps2
             c = col + (d == 3) - (d == 2)
             if r < 0 or c < 0 or r >= height or c >= width:
                 continue
-            if labels[r, c] != 0 or flags[r, c] & INVALID != 0 or within[r, c] != within[row, col]:
+            if labels[r, c] != 0 or flags[r, c] & INVALID != 0:
+                continue
+            if bounded and within[r, c] != within[row, col]:
                 continue
             bucket = _bucket(models, k, image, flags, r, c, n_range, law, color_eps2, max_cost)
             if bucket >= 0:
@@ -184,11 +202,11 @@ def absorb(
     within : (H, W) int32, optional; growth never crosses from one value of it to another
     Returns the number of pixels that were absorbed.
     """
-    unassigned = int(np.count_nonzero((labels == 0) & (signals.flags & INVALID == 0)))
+    unassigned = count_unassigned(labels, signals.flags)
     if unassigned == 0:
         return 0
     if within is None:
-        within = np.zeros_like(labels)
+        within = np.zeros((1, 1), np.int32)
     absorbed: int = _grow(
         signals.image, signals.flags, labels, leaves, within, models, signals.n_range, signals.law,
         signals.color_eps2, max_cost, _make_offers(unassigned),

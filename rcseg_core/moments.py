@@ -13,7 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rcseg_core.jit import bare, kernel
+from rcseg_core.jit import bare
+from rcseg_core.parallel import BANDS, over_bands
 
 #: Coordinates are pixels divided by this, which keeps eighth powers of a VGA image near one.
 UNIT_PX = 32.0
@@ -49,91 +50,105 @@ def tensor_exponents(degree: int) -> NDArray[np.int64]:
     return np.array([[a, b] for a in range(degree + 1) for b in range(degree + 1)], np.int64)
 
 
-@kernel
-def region_boxes(labels, count):  # type: ignore[no-untyped-def]
-    """(count + 1, 4) int64 boxes row_min, col_min, row_max, col_max (inclusive) of labels 1..count."""
-    height, width = labels.shape
-    box = np.empty((count + 1, 4), np.int64)
-    box[:, 0] = height
-    box[:, 1] = width
-    box[:, 2] = -1
-    box[:, 3] = -1
-    for row in range(height):
-        for col in range(width):
+@bare
+def _boxes(labels, first, last, box):  # type: ignore[no-untyped-def]
+    """Widen box (N + 1, 4) by the runs of rows first..last-1."""
+    width = labels.shape[1]
+    for row in range(first, last):
+        col = 0
+        while col < width:
             k = labels[row, col]
+            start = col
+            col += 1
+            while col < width and labels[row, col] == k:
+                col += 1
             if k > 0:
                 box[k, 0] = min(box[k, 0], row)
-                box[k, 1] = min(box[k, 1], col)
-                box[k, 2] = row
-                box[k, 3] = max(box[k, 3], col)
+                box[k, 1] = min(box[k, 1], start)
+                box[k, 2] = max(box[k, 2], row)
+                box[k, 3] = max(box[k, 3], col - 1)
+
+
+def region_boxes(labels: NDArray[np.int32], count: int) -> NDArray[np.int64]:
+    """(count + 1, 4) int64 boxes row_min, col_min, row_max, col_max (inclusive) of labels 1..count."""
+    box = np.empty((count + 1, 4), np.int64)
+    box[:] = (*labels.shape, -1, -1)
+    _boxes(labels, 0, labels.shape[0], box)
     return box
 
 
-@kernel
-def _sum_runs(image, flags, labels, center, power, cross, energy):  # type: ignore[no-untyped-def]
-    """One pass over the image: a run of one label in a row is summed in x, then spread over powers of y."""
-    height, width, channels = image.shape
+@bare
+def _sum_runs(image, flags, labels, first, last, center, power, cross, energy, run):  # type: ignore[no-untyped-def]
+    """One pass over rows: a run of one label is summed in x, then spread over powers of y.
+
+    run : (C + 1, 2k + 1) float64 scratch
+    """
+    width, channels = image.shape[1], image.shape[2]
     top = power.shape[1]
     low = cross.shape[2]
-    run_power = np.zeros(top)
-    run_cross = np.zeros((channels, low))
-    run_energy = np.zeros(channels)
-    for row in range(height):
+    for row in range(first, last):
         col = 0
         while col < width:
             k = labels[row, col]
             if k <= 0:
                 col += 1
                 continue
-            run_power[:] = 0.0
-            run_cross[:, :] = 0.0
-            run_energy[:] = 0.0
+            for c in range(channels + 1):
+                for a in range(top):
+                    run[c, a] = 0.0
             while col < width and labels[row, col] == k:
                 if flags[row, col] == 0:
                     x = (col - center[k, 0]) / UNIT_PX
                     xa = 1.0
                     for a in range(top):
-                        run_power[a] += xa
+                        run[channels, a] += xa
                         xa *= x
                     for c in range(channels):
                         v = np.float64(image[row, col, c])
-                        run_energy[c] += v * v
+                        energy[k, c] += v * v
                         for a in range(low):
-                            run_cross[c, a] += v
+                            run[c, a] += v
                             v *= x
                 col += 1
             y = (row - center[k, 1]) / UNIT_PX
             for a in range(top):
-                value = run_power[a]
+                value = run[channels, a]
                 for b in range(top):
                     power[k, a, b] += value
                     value *= y
             for c in range(channels):
-                energy[k, c] += run_energy[c]
                 for a in range(low):
-                    value = run_cross[c, a]
+                    value = run[c, a]
                     for b in range(low):
                         cross[k, c, a, b] += value
                         value *= y
 
 
 def accumulate(
-    image: NDArray[np.float32], flags: NDArray[np.uint8], labels: NDArray[np.int32], count: int, degree: int
-) -> Moments:
+    image: NDArray[np.float32], flags: NDArray[np.uint8], labels: NDArray[np.int32], count: int, degree: int,
+    boxes: NDArray[np.int64] | None = None,
+) -> Moments:  # fmt: skip
     """Moments of regions 1..count for models up to `degree`; flagged pixels count for nothing.
 
     Parameters
     ----------
     image : (H, W, C) float32; flags : (H, W) uint8, non-zero leaves a pixel out; labels : (H, W) int32
+    boxes : (count + 1, 4) int64, `region_boxes` where they are known
     """
     channels = image.shape[2]
-    box = region_boxes(labels, count)
+    box = region_boxes(labels, count) if boxes is None else boxes
     center = np.stack([(box[:, 1] + box[:, 3]) / 2.0, (box[:, 0] + box[:, 2]) / 2.0], 1)
-    power = np.zeros((count + 1, 2 * degree + 1, 2 * degree + 1))
-    cross = np.zeros((count + 1, channels, degree + 1, degree + 1))
-    energy = np.zeros((count + 1, channels))
-    _sum_runs(image, flags, labels, center, power, cross, energy)
-    return Moments(center, power, cross, energy)
+    top = 2 * degree + 1
+    power = np.zeros((BANDS, count + 1, top, top))
+    cross = np.zeros((BANDS, count + 1, channels, degree + 1, degree + 1))
+    energy = np.zeros((BANDS, count + 1, channels))
+    run = np.empty((BANDS, channels + 1, top))
+
+    def sum_band(i: int, first: int, last: int) -> None:
+        _sum_runs(image, flags, labels, first, last, center, power[i], cross[i], energy[i], run[i])
+
+    over_bands(labels.shape[0], sum_band)
+    return Moments(center, power.sum(axis=0), cross.sum(axis=0), energy.sum(axis=0))
 
 
 @bare

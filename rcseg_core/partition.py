@@ -7,18 +7,17 @@ grouping adds moments and joins pairs, so several passes need the image only onc
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rcseg_core.absorption import absorb, refine
+from rcseg_core.absorption import absorb, count_unassigned, refine
 from rcseg_core.adjacency import Pairs, find_pairs
 from rcseg_core.grouping import Grouped
 from rcseg_core.hierarchy import TreeBuilder
-from rcseg_core.jit import bare, kernel
+from rcseg_core.jit import bare
 from rcseg_core.models import Models
 from rcseg_core.moments import Moments, accumulate, region_boxes
-from rcseg_core.signals import Signals
+from rcseg_core.signals import INVALID, Signals
 
 
 @bare
@@ -36,14 +35,86 @@ def _follow(merges, target):  # type: ignore[no-untyped-def]
         target[merges[t, 1]] = target[merges[t, 0]]
 
 
-@kernel
-def count_pixels(labels, count):  # type: ignore[no-untyped-def]
+@bare
+def _count_runs(labels, sizes):  # type: ignore[no-untyped-def]
+    """sizes[k] += pixels of label k, a run at a time."""
+    height, width = labels.shape
+    for row in range(height):
+        start = 0
+        for col in range(1, width + 1):
+            if col == width or labels[row, col] != labels[row, start]:
+                sizes[labels[row, start]] += col - start
+                start = col
+
+
+def count_pixels(labels: NDArray[np.int32], count: int) -> NDArray[np.int64]:
     """(count + 1,) int64 number of pixels of each label."""
     sizes = np.zeros(count + 1, np.int64)
-    for row in range(labels.shape[0]):
-        for col in range(labels.shape[1]):
-            sizes[labels[row, col]] += 1
+    _count_runs(labels, sizes)
     return sizes
+
+
+@bare
+def _first_groups(labels, within, group):  # type: ignore[no-untyped-def]
+    """group[k] = value of `within` at the last run of label k; the same all over k."""
+    height, width = labels.shape
+    for row in range(height):
+        before = np.int32(0)
+        for col in range(width):
+            k = labels[row, col]
+            if k != before:
+                group[k] = within[row, col]
+                before = k
+
+
+@bare
+def _flood(labels, leaves, flags, within, least, first_label, first_leaf, queue):  # type: ignore[no-untyped-def]
+    """Number the 4-connected parts of unassigned pixels that have at least `least`; returns how many.
+
+    Only measured pixels with within > 0 take part, and a part keeps to one value of it (within of shape
+    (1, 1): no bounds). queue : (unassigned pixels,) int64 scratch.
+    """
+    height, width = labels.shape
+    bounded = within.shape[0] == height
+    found = 0
+    end = 0
+    for row in range(height):
+        for col in range(width):
+            if labels[row, col] != 0 or flags[row, col] & INVALID != 0:
+                continue
+            start = end
+            queue[end] = row * width + col
+            end += 1
+            labels[row, col] = -1
+            at = start
+            while at < end:
+                y = queue[at] // width
+                x = queue[at] - y * width
+                at += 1
+                for d in range(4):
+                    r = y + (d == 1) - (d == 0)
+                    c = x + (d == 3) - (d == 2)
+                    if r < 0 or c < 0 or r >= height or c >= width:
+                        continue
+                    if labels[r, c] != 0 or flags[r, c] & INVALID != 0:
+                        continue
+                    if bounded and within[r, c] != within[y, x]:
+                        continue
+                    labels[r, c] = -1
+                    queue[end] = r * width + c
+                    end += 1
+            if end - start >= least:
+                for i in range(start, end):
+                    y = queue[i] // width
+                    x = queue[i] - y * width
+                    labels[y, x] = first_label + found
+                    leaves[y, x] = first_leaf + found
+                found += 1
+    for i in range(end):
+        y = queue[i] // width
+        x = queue[i] - y * width
+        labels[y, x] = max(labels[y, x], 0)
+    return found
 
 
 @bare
@@ -78,7 +149,9 @@ class Partition:
         """Moments of the regions for models up to `degree` or more; grouping may add them up in place."""
         kept = self._moments
         if kept is None or kept.cross.shape[2] <= degree or kept.cross.shape[1] != signals.image.shape[2]:
-            kept = accumulate(signals.image, signals.flags, self.labels, self.count, degree)
+            kept = accumulate(
+                signals.image, signals.flags, self.labels, self.count, degree, self.boxes()
+            )  # fmt: skip
             self._moments = kept
         return kept
 
@@ -134,29 +207,19 @@ class Partition:
         if self._pairs is not None:
             self._pairs = self._pairs.relabelled(mapping)
 
-    def add_leftovers(self, candidates: NDArray[np.bool_], least: int) -> int:
-        """Unassigned pixels become regions where at least `least` hang together; returns how many regions."""
-        rest = (candidates & (self.labels == 0)).astype(np.uint8)
-        if not rest.any():
+    def add_leftovers(self, flags: NDArray[np.uint8], least: int) -> int:
+        """Measured unassigned pixels become regions where at least `least` hang together; returns how many."""
+        room = count_unassigned(self.labels, flags)
+        if room == 0:
             return 0
-        parts = cv2.connectedComponents(rest, connectivity=4)[1]
-        if self.within is not None:
-            at = rest > 0
-            keys = parts[at].astype(np.int64) * (int(self.within.max()) + 1) + self.within[at]
-            parts[at] = np.unique(keys, return_inverse=True)[1] + 1
-        areas = np.bincount(parts[rest > 0])
-        large = areas >= least
-        found = areas.size
-        extra = int(large.sum())
+        old_leaves = self.tree.leaf_count
+        within = np.zeros((1, 1), np.int32) if self.within is None else self.within
+        extra: int = _flood(
+            self.labels, self.leaves, flags, within, least, self.count + 1, old_leaves + 1,
+            np.empty(room, np.int64),
+        )  # fmt: skip
         if extra == 0:
             return 0
-        number = np.zeros(found, np.int32)
-        number[large] = np.arange(1, extra + 1)
-        part = np.where(rest > 0, number[parts], 0)
-        new = part > 0
-        self.labels[new] = part[new] + self.count
-        old_leaves = self.tree.leaf_count
-        self.leaves[new] = part[new] + old_leaves
         self.tree.add_leaves(extra)
         inner = self.nodes > old_leaves
         self.nodes[inner] += extra
@@ -180,7 +243,7 @@ class Partition:
         if self.within is None:
             return None
         group = np.zeros(self.count + 1, np.int64)
-        group[self.labels.ravel()] = self.within.ravel()
+        _first_groups(self.labels, self.within, group)
         group[0] = 0
         return group
 

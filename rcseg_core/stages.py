@@ -14,7 +14,7 @@ from rcseg_core.models import Models, fit_models
 from rcseg_core.moments import Moments, plane_exponents, tensor_exponents
 from rcseg_core.partition import Partition
 from rcseg_core.rule import KINDS, POINTS, Rule
-from rcseg_core.signals import INVALID, MISFIT, Signals, scales
+from rcseg_core.signals import MISFIT, Signals, scales
 
 #: A limit that any pair with a joint model keeps.
 NO_LIMIT = 1e9
@@ -120,8 +120,7 @@ def absorb_points(partition: Partition, signals: Signals, models: Models, config
     Returns the number of regions that were added.
     """
     partition.absorb(signals, models, config.absorption.max_cost)
-    measured = signals.flags & INVALID == 0
-    return partition.add_leftovers(measured, scaled(config.absorption.min_region, signals.flags))
+    return partition.add_leftovers(signals.flags, scaled(config.absorption.min_region, signals.flags))
 
 
 def settle(partition: Partition, signals: Signals, config: SegmenterConfig) -> None:
@@ -130,14 +129,14 @@ def settle(partition: Partition, signals: Signals, config: SegmenterConfig) -> N
     models = final_models(partition, signals, config)[1]
     if absorb_points(partition, signals, models, config):
         models = final_models(partition, signals, config)[1]
-    unpredicted = partition.labels == 0
+    unassigned = partition.labels == 0
     for limit in (1e4, 1e12):  # the order still matters; the limit no longer does
         partition.absorb(signals, models, limit)
-    signals.flags[unpredicted & (partition.labels > 0)] |= MISFIT
+    signals.flags[unassigned & (partition.labels > 0)] |= MISFIT
     if partition.within is None:
         partition.refine(signals, models, config.absorption.refine_passes)
     else:  # small parts of `within` that no region reached
-        partition.add_leftovers((partition.within > 0) & (signals.flags & INVALID == 0), 1)
+        partition.add_leftovers(signals.flags, 1)
 
 
 def scaled(pixels: int, image: NDArray[np.uint8]) -> int:
