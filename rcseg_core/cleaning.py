@@ -6,8 +6,6 @@ flying pixel): it neither blocks a seed window nor enters a fit. Filled values f
 
 from __future__ import annotations
 
-from typing import Any
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -70,17 +68,14 @@ def fill_rows(image, valid, out):  # type: ignore[no-untyped-def]
                 out[row, col] = out[first, col]
 
 
-def local_median(channels: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """5x5 median of each channel of (H, W, C) float32, with invalid pixels filled along rows first."""
-    out = np.empty_like(channels)
+def local_median(channels: NDArray[np.float32], valid: NDArray[np.bool_], out: NDArray[np.float32]) -> None:
+    """5x5 median of each channel of (H, W, C) float32 into `out`, invalid pixels filled along rows first."""
     filled = np.empty(channels.shape[:2], np.float32)
     for c in range(channels.shape[2]):
         fill_rows(channels[..., c], valid, filled)
         out[..., c] = cv2.medianBlur(filled, 5)
-    return out
 
 
-def color_median(color: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """5x5 median of each colour channel."""
-    median: NDArray[Any] = cv2.medianBlur(np.ascontiguousarray(color), 5)
-    return median
+def color_median(color: NDArray[np.uint8], out: NDArray[np.uint8]) -> None:
+    """5x5 median of each colour channel into `out`."""
+    cv2.medianBlur(np.ascontiguousarray(color), 5, dst=out)

@@ -13,14 +13,15 @@ depth noise (c, since dw = w^2 dz) and Kinect after Nguyen et al. (all three).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from rcseg_core.config import NoiseConfig
-from rcseg_core.jit import kernel
+from rcseg_core.jit import bare
+from rcseg_core.parallel import over_bands
 
 WINDOW_PX = 21
 #: Windows to a side of the image that are enough for its quantiles; small images overlap them.
@@ -70,32 +71,37 @@ class NoiseModel:
         return np.asarray(a + b * signal + c * signal * signal, np.float64)
 
 
-@kernel
-def window_residuals(values, median, valid, spread, stride, out):  # type: ignore[no-untyped-def]
+@bare
+def window_residuals(values, median, valid, channel, spread, stride, first, last, out):  # type: ignore[no-untyped-def]
     """Residuals about a plane in windows of one channel, impulses (> 6 spread from the median) left out.
 
-    values, median : (H, W) float32; valid : (H, W) bool; spread : scale of values - median; out : (n, 4)
+    values, median : (H, W, C) float32 or uint8; valid : (H, W) bool, or (1, 1) where all are;
+    spread : scale of values - median; first, last : rows of windows, `stride` apart; out : (n, 4)
     float64, mean, rms, the mean square of 5x5 block means times 25, and the mean size of the steps between
     pixels that differ, beside the slope (the quantum of a quantised sensor); NaN where under half of a window
     is usable.
     """
-    height, width = values.shape
+    height, width = values.shape[0], values.shape[1]
+    masked = valid.shape[0] == height
     half = WINDOW_PX // 2
     per_side = WINDOW_PX // BLOCK_PX
-    index = 0
-    for row0 in range(0, height - WINDOW_PX + 1, stride):
+    index = first * ((width - WINDOW_PX) // stride + 1)
+    for row0 in range(first * stride, last * stride, stride):
         for col0 in range(0, width - WINDOW_PX + 1, stride):
             s0 = sx = sy = sxx = sxy = syy = v0 = vx = vy = vv = 0.0
-            ref = np.float64(median[row0 + half, col0 + half])
+            ref = np.float64(median[row0 + half, col0 + half, channel])
             for i in range(WINDOW_PX):
                 for j in range(WINDOW_PX):
                     r = row0 + i
                     c = col0 + j
-                    if not valid[r, c] or abs(values[r, c] - median[r, c]) > 6.0 * spread:
+                    if masked and not valid[r, c]:
+                        continue
+                    value = np.float64(values[r, c, channel])
+                    if abs(value - median[r, c, channel]) > 6.0 * spread:
                         continue
                     x = j - half
                     y = i - half
-                    v = values[r, c] - ref
+                    v = value - ref
                     s0 += 1.0
                     sx += x
                     sy += y
@@ -138,12 +144,17 @@ def window_residuals(values, median, valid, spread, stride, out):  # type: ignor
                         x = (block % per_side) * BLOCK_PX + j
                         r = row0 + y
                         c = col0 + x
-                        if not valid[r, c] or abs(values[r, c] - median[r, c]) > 6.0 * spread:
+                        if masked and not valid[r, c]:
+                            continue
+                        value = np.float64(values[r, c, channel])
+                        if abs(value - median[r, c, channel]) > 6.0 * spread:
                             continue
                         n += 1.0
-                        total += values[r, c] - g0 - gx * (x - half) - gy * (y - half)
-                        step = np.float64(values[r, c + 1]) - np.float64(values[r, c])
-                        if step != 0.0 and valid[r, c + 1] and abs(step - gx) <= 8.0 * out[index - 1, 1]:
+                        total += value - g0 - gx * (x - half) - gy * (y - half)
+                        step = np.float64(values[r, c + 1, channel]) - value
+                        if step == 0.0 or (masked and not valid[r, c + 1]):
+                            continue
+                        if abs(step - gx) <= 8.0 * out[index - 1, 1]:
                             steps += 1.0
                             quantum += abs(step - gx)
                 if n >= 12.0:
@@ -164,19 +175,26 @@ class _Windows(NamedTuple):
 
 
 def _measure(
-    values: NDArray[np.float32], median: NDArray[np.float32], valid: NDArray[np.bool_],
+    values: NDArray[Any], median: NDArray[Any], valid: NDArray[np.bool_] | None, channel: int,
     windows_a_side: int = WINDOWS_A_SIDE,
 ) -> _Windows:  # fmt: skip
-    """Residuals of all windows of one channel."""
-    height, width = values.shape
+    """Residuals of all windows of one channel; valid = None: every pixel counts."""
+    height, width = values.shape[:2]
     stride = max(8, min(height, width) // windows_a_side)
-    count = max(0, (height - WINDOW_PX) // stride + 1) * max(0, (width - WINDOW_PX) // stride + 1)
+    rows = max(0, (height - WINDOW_PX) // stride + 1)
+    count = rows * max(0, (width - WINDOW_PX) // stride + 1)
     table = np.full((count, 4), np.nan)
-    away = np.abs(values[::3, ::3] - median[::3, ::3])[valid[::3, ::3]]
+    away = np.abs(values[::3, ::3, channel].astype(np.float32) - median[::3, ::3, channel])
+    away = away.ravel() if valid is None else away[valid[::3, ::3]]
     # 70 % of the distances are noise even when 20 % of the pixels are impulses; 1.04 sigma at 70 %
     spread = max(float(np.quantile(away, 0.7)) if away.size else 0.0, 1e-9)
     if count:
-        window_residuals(values, median, valid, spread, stride, table)
+        mask = np.ones((1, 1), np.bool_) if valid is None else valid
+
+        def measure_rows(_: int, first: int, last: int) -> None:
+            window_residuals(values, median, mask, channel, spread, stride, first, last, table)
+
+        over_bands(rows, measure_rows)
     table = table[np.isfinite(table[:, :2]).all(axis=1)]
     quiet = table[table[:, 1] <= np.median(table[:, 1])] if len(table) else table
     quiet = quiet[np.isfinite(quiet[:, 2]) & (quiet[:, 1] > 0)]
@@ -245,7 +263,7 @@ def estimate_noise(
     """
     scale = float(np.abs(typical_values(signal, valid)[-1]))
     floor = RELATIVE_FLOOR * scale
-    windows = [_measure(signal[..., c], median[..., c], valid) for c in range(signal.shape[2])]
+    windows = [_measure(signal, median, valid, c) for c in range(signal.shape[2])]
     source: str = config.range_model
     if config.range_model == "auto":
         source = "estimated"
@@ -265,14 +283,7 @@ def estimate_noise(
         a, b, c = SENSOR_MODELS[config.range_model]
         sigma_m = (a + b / scale + c / scale**2) * scale**2  # at the median depth: dz = z^2 dw
         law = np.array([(sigma_m, 0.0, 0.0)] * 3)
-    everywhere = np.ones(color.shape[:2], np.bool_)
-    colors = [
-        _measure(
-            color[..., c].astype(np.float32), color_median[..., c].astype(np.float32), everywhere,
-            COLOR_WINDOWS_A_SIDE,
-        )
-        for c in range(3)
-    ]  # fmt: skip
+    colors = [_measure(color, color_median, None, c, COLOR_WINDOWS_A_SIDE) for c in range(3)]
     sigma_c = np.maximum([_quiet_rms(w.rms) for w in colors], COLOR_FLOOR_LEVELS)
     if config.color_sigma > 0:
         sigma_c = np.full(3, config.color_sigma)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 
 #: Bands of an image: enough to share out evenly, few enough that their tables are added up in no time.
 BANDS = 4
@@ -82,9 +82,11 @@ def together(*tasks: Callable[[], object]) -> None:
     try:
         work()
     finally:
-        for helper in helpers:
-            helper.exception()  # waits
-    for helper in helpers:
+        # all tasks are taken by now: a helper that has not begun has nothing to do (and may never begin, when
+        # all workers wait like this)
+        begun = [helper for helper in helpers if not helper.cancel()]
+        wait(begun)
+    for helper in begun:
         helper.result()
 
 

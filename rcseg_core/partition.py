@@ -71,8 +71,8 @@ def _first_groups(labels, within, group):  # type: ignore[no-untyped-def]
 def _flood(labels, leaves, flags, within, least, first_label, first_leaf, queue):  # type: ignore[no-untyped-def]
     """Number the 4-connected parts of unassigned pixels that have at least `least`; returns how many.
 
-    Only measured pixels with within > 0 take part, and a part keeps to one value of it (within of shape
-    (1, 1): no bounds). queue : (unassigned pixels,) int64 scratch.
+    Only measured pixels take part, and a part keeps to one value of `within` ((1, 1): no bounds).
+    queue : (unassigned pixels,) int64 scratch.
     """
     height, width = labels.shape
     bounded = within.shape[0] == height

@@ -19,6 +19,7 @@ from rcseg_core.frame import RangeColorFrame
 from rcseg_core.jit import bare
 from rcseg_core.moments import UNIT_PX
 from rcseg_core.noise import NoiseModel, estimate_noise, typical_values
+from rcseg_core.parallel import over_bands, together
 
 # Flags of a pixel, a bit mask in `Signals.flags`.
 INVALID, RANGE_OUTLIER, COLOR_OUTLIER = 1, 2, 4
@@ -37,7 +38,9 @@ class Signals:
     Attributes
     ----------
     image : (H, W, C) float32, C = Cr + 3; channel c is (signal - offset[c]) / scale[c]; 0 where invalid
-    cleaned : (H, W, C) float32, image with invalid pixels and impulses replaced by the local median
+    cleaned : (H, W, Cr) float32, the range of `image` with invalid pixels and impulses replaced by the local
+        median
+    cleaned_color : (H, W, 3) uint8, the colour with impulses replaced by the local median
     flags : (H, W) uint8 bit mask: 1 invalid, 2 range impulse, 4 colour impulse, 8 misfit (set later)
     n_range : Cr, 1 for inverse depth, 3 for x, y, z
     scale, offset : (C,) float64
@@ -50,6 +53,7 @@ class Signals:
 
     image: NDArray[np.float32]
     cleaned: NDArray[np.float32]
+    cleaned_color: NDArray[np.uint8]
     flags: NDArray[np.uint8]
     n_range: int
     scale: NDArray[np.float64]
@@ -65,8 +69,7 @@ class Signals:
         n = self.n_range
         return replace(
             self,
-            image=np.ascontiguousarray(self.image[..., :n]),
-            cleaned=self.cleaned[..., :n],
+            image=_channels(self.image, 0, n),
             flags=self.flags & np.uint8(INVALID | RANGE_OUTLIER),
             scale=self.scale[:n],
             offset=self.offset[:n],
@@ -77,13 +80,27 @@ class Signals:
         n = self.n_range
         return replace(
             self,
-            image=np.ascontiguousarray(self.image[..., n:]),
-            cleaned=self.cleaned[..., n:],
+            image=_channels(self.image, n, n + 3),
             flags=self.flags & np.uint8(INVALID | COLOR_OUTLIER),
             n_range=0,
             scale=self.scale[n:],
             offset=self.offset[n:],
         )
+
+
+@bare
+def _copy_channels(image, first_channel, first, last, out):  # type: ignore[no-untyped-def]
+    for row in range(first, last):
+        for col in range(out.shape[1]):
+            for c in range(out.shape[2]):
+                out[row, col, c] = image[row, col, first_channel + c]
+
+
+def _channels(image: NDArray[np.float32], first: int, last: int) -> NDArray[np.float32]:
+    """Channels first..last-1, contiguous."""
+    out = np.empty((*image.shape[:2], last - first), np.float32)
+    over_bands(out.shape[0], lambda _, a, b: _copy_channels(image, first, a, b, out))
+    return out
 
 
 @bare
@@ -128,8 +145,8 @@ def build_signals(frame: RangeColorFrame, color: NDArray[np.uint8], config: Segm
     valid = frame.valid
     inverse = uses_inverse_depth(frame, config)
     raw = _range_signal(frame, inverse)
-    median_r = local_median(raw, valid)
-    median_c = color_median(color)
+    median_r, median_c = np.empty_like(raw), np.empty_like(color)
+    together(lambda: local_median(raw, valid, median_r), lambda: color_median(color, median_c))
     noise = estimate_noise(raw, median_r, valid, color, median_c, inverse, config.noise)
 
     n_range = raw.shape[2]
@@ -139,15 +156,21 @@ def build_signals(frame: RangeColorFrame, color: NDArray[np.uint8], config: Segm
     law = _law(noise, scale[0], typical, inverse, frame, config.grouping.range_tolerance)
     eps_c = config.grouping.color_tolerance / noise.color
 
-    shape = (*valid.shape, n_range + 3)
-    image, cleaned = np.empty(shape, np.float32), np.empty(shape, np.float32)
+    image = np.empty((*valid.shape, n_range + 3), np.float32)
+    cleaned, cleaned_color = np.empty_like(raw), np.empty_like(color)
     flags = np.empty(valid.shape, np.uint8)
-    whiten(
-        raw, median_r, color, median_c, valid, scale, offset, law, config.edges.outlier_threshold, image,
-        cleaned, flags,
-    )  # fmt: skip
+
+    levels = ((np.arange(256.0) - offset[n_range:, None]) / scale[n_range:, None]).astype(np.float32)
+
+    def whiten_rows(_: int, first: int, last: int) -> None:
+        whiten(
+            raw, median_r, color, median_c, valid, scale, offset, levels, law, config.edges.outlier_threshold,
+            first, last, image, cleaned, cleaned_color, flags,
+        )  # fmt: skip
+
+    over_bands(valid.shape[0], whiten_rows)
     return Signals(
-        image, cleaned, flags, n_range, scale, offset, law, float(np.sum(eps_c**2)) / 3.0,
+        image, cleaned, cleaned_color, flags, n_range, scale, offset, law, float(np.sum(eps_c**2)) / 3.0,
         _slope(frame, scale, offset, inverse), noise, inverse,
     )  # fmt: skip
 
@@ -207,16 +230,20 @@ def _in_company(color, row, col, scale, n_range, limit):  # type: ignore[no-unty
 
 
 @bare
-def whiten(raw, median_r, color, median_c, valid, scale, offset, law, threshold, image, cleaned, flags):  # type: ignore[no-untyped-def]
-    """Whiten a frame into `image`, flag impulses, and put the local median in their place in `cleaned`.
+def whiten(  # type: ignore[no-untyped-def]
+    raw, median_r, color, median_c, valid, scale, offset, levels, law, threshold, first, last, image,
+    cleaned, cleaned_color, flags,
+):  # fmt: skip
+    """Whiten rows first..last-1 of a frame into `image`, flag impulses, put the local median in their place.
 
     raw, median_r : (H, W, Cr) float32; color, median_c : (H, W, 3) uint8; valid : (H, W) bool;
-    scale, offset : (C,) float64; threshold : sigmas from the local median that make an impulse, 0 for none.
-    Out: image, cleaned (H, W, C) float32, flags (H, W) uint8.
+    scale, offset : (C,) float64; levels : (3, 256) float32, the whitened value of each level of a colour;
+    threshold : sigmas from the local median that make an impulse, 0 for none.
+    Out: image (H, W, C), cleaned (H, W, Cr) float32; cleaned_color (H, W, 3), flags (H, W) uint8.
     """
-    height, width, n_range = raw.shape
+    width, n_range = raw.shape[1], raw.shape[2]
     limit = threshold * threshold
-    for row in range(height):
+    for row in range(first, last):
         for col in range(width):
             flag = 0
             far = 0.0
@@ -241,27 +268,33 @@ def whiten(raw, median_r, color, median_c, valid, scale, offset, law, threshold,
                 else:
                     for c in range(n_range):
                         cleaned[row, col, c] = image[row, col, c]
-            far = 0.0
+            away = False
             for c in range(3):
-                center = (median_c[row, col, c] - offset[n_range + c]) / scale[n_range + c]
-                cleaned[row, col, n_range + c] = center
-                value = (color[row, col, c] - offset[n_range + c]) / scale[n_range + c]
-                image[row, col, n_range + c] = value
-                far = max(far, (value - center) * (value - center))
-            if threshold > 0.0 and far > limit and not _in_company(color, row, col, scale, n_range, limit):
+                level = color[row, col, c]
+                image[row, col, n_range + c] = levels[c, level]
+                cleaned_color[row, col, c] = level
+                away |= abs(np.float64(level) - median_c[row, col, c]) > threshold * scale[n_range + c]
+            if threshold > 0.0 and away and not _in_company(color, row, col, scale, n_range, limit):
                 flag |= COLOR_OUTLIER
-            else:
-                for c in range(n_range, n_range + 3):
-                    cleaned[row, col, c] = image[row, col, c]
+                for c in range(3):
+                    cleaned_color[row, col, c] = median_c[row, col, c]
             flags[row, col] = flag
 
 
 def _range_signal(frame: RangeColorFrame, inverse: bool) -> NDArray[np.float32]:
     if not inverse:
         return np.where(frame.valid[..., None], frame.points, 0).astype(np.float32)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        inv = 1.0 / frame.depth_m
-    return np.where(frame.valid, inv, 0).astype(np.float32)[..., None]
+    out = np.empty((*frame.valid.shape, 1), np.float32)
+    over_bands(frame.height, lambda _, a, b: _invert(frame.depth_m, frame.valid, a, b, out))
+    return out
+
+
+@bare
+def _invert(depth_m, valid, first, last, out):  # type: ignore[no-untyped-def]
+    """out = 1 / depth, 0 where invalid."""
+    for row in range(first, last):
+        for col in range(out.shape[1]):
+            out[row, col, 0] = 1.0 / depth_m[row, col] if valid[row, col] else 0.0
 
 
 def _typical_sigma(noise: NoiseModel, typical: NDArray[np.float64]) -> NDArray[np.float64]:
