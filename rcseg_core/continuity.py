@@ -87,7 +87,7 @@ def _border(labels, slot, models, c, law, slope, out):  # type: ignore[no-untype
 
 def continuous_pairs(
     labels: NDArray[np.int32], signals: Signals, models: Models, pairs: Pairs, curved: NDArray[np.bool_],
-    sliver_px: float,
+    sizes: NDArray[np.int64], sliver_px: float,
 ) -> Grouped:  # fmt: skip
     """The groupings that continuity asks for, the smoothest first; each region is taken in at most once.
 
@@ -95,10 +95,10 @@ def continuous_pairs(
     ----------
     labels : (H, W) int32; models : fitted to its regions
     curved : (N + 1,) bool, regions whose relief exceeds the tolerance
+    sizes : (N + 1,) int64, pixels of each region
     sliver_px : smaller neighbours are judged by their position alone
     """
     count = models.degree.shape[0] - 1
-    sizes = np.bincount(labels.ravel(), minlength=count + 1)
     a, b = pairs.nodes.T
     big = np.where(sizes[a] >= sizes[b], a, b)
     small = a + b - big

@@ -67,10 +67,10 @@ def _subtract(image, other, first, last):  # type: ignore[no-untyped-def]
 
 @bare
 def _write(  # type: ignore[no-untyped-def]
-    is_step, near_step, crease, ridge, cleaned, law, crease_threshold, high, low, color_threshold, flags, first,
-    last, edges,
+    is_step, near_step, crease, ridge, cleaned, law, crease_threshold, high, low, color_threshold, flags,
+    first, last, edges,
 ):  # fmt: skip
-    """The bits of rows first..last-1 from the responses; a crease counts on the ridge of its response only."""
+    """The bits of rows first..last-1; a crease counts on the ridge of its response only."""
     for row in range(first, last):
         for col in range(edges.shape[1]):
             bits = 0
@@ -114,8 +114,8 @@ def detect_edges(signals: Signals, config: EdgesConfig) -> NDArray[np.uint8]:
     over_bands(
         shape[0],
         lambda _, first, last: _write(
-            is_step, near_step, crease, ridge, signals.cleaned, law, config.orientation_threshold * gain, high,
-            low, config.color_threshold, signals.flags, first, last, edges,
+            is_step, near_step, crease, ridge, signals.cleaned, law, config.orientation_threshold * gain,
+            high, low, config.color_threshold, signals.flags, first, last, edges,
         ),
     )  # fmt: skip
     return edges

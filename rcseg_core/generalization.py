@@ -26,7 +26,7 @@ PIXELS_PER_COEFFICIENT = 8
 def residual_table(moments, n_range, exponents, gram, work, out):  # type: ignore[no-untyped-def]
     """out[k, modality, degree - 1]: residual sum of squares of region k for each degree, eq. (14).
 
-    exponents : (p, 2), the terms of the highest degree, those of each lower degree first (`nested_exponents`);
+    exponents : (p, 2) terms of the highest degree, those of each lower one first (`nested_exponents`);
     gram : (p + 1, p), work : (p,) scratch. With R = L L^T in that order, z = L^-1 v gives the residual of all
     degrees at once: T T^T - z_0^2 - ... up to the last term of the degree.
     """
@@ -68,7 +68,7 @@ def nested_exponents(degree: int) -> NDArray[np.int64]:
 
 
 def residuals_by_degree(moments: Moments, n_range: int, highest: int) -> NDArray[np.float64]:
-    """(N + 1, 2, highest) residual sums of squares of each region, for range and colour, degrees 1 to highest."""
+    """(N + 1, 2, highest) residual sums of squares of range and colour at degrees 1 to highest."""
     terms = nested_exponents(min(highest, moments.cross.shape[2] - 1))
     out = np.zeros((moments.energy.shape[0], 2, highest))
     residual_table(moments, n_range, terms, np.empty((len(terms) + 1, len(terms))), np.empty(len(terms)), out)

@@ -8,6 +8,7 @@ add only about one centre; `shift_grid` moves them there binomially.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -77,51 +78,143 @@ def region_boxes(labels: NDArray[np.int32], count: int) -> NDArray[np.int64]:
     return box
 
 
+@lru_cache(maxsize=4)
+def power_table(width: int) -> NDArray[np.float64]:
+    """(4 W + 5, 9) sums of powers of x: a run of pixels in a row is the difference of two rows of it.
+
+    Row d + 2 W + 2 holds, for each a, the sum of (e / (2 UNIT_PX))^a over all e of the parity of d from 0 (or
+    1) to below d; its negative where d < 0. Counted outwards from the centre of a region no digits are lost.
+    """
+    reach = 2 * width + 2
+    steps = np.arange(-reach, reach + 1)
+    powers = (steps[:, None] / (2.0 * UNIT_PX)) ** np.arange(9)
+    table = np.zeros_like(powers)
+    for first in (0, 1):
+        at = reach + first
+        table[at + 2 :: 2] = np.cumsum(powers[at:-2:2], axis=0)
+        table[at - 2 :: -2] = -np.cumsum(powers[at - 2 :: -2], axis=0)
+    table.setflags(write=False)
+    return table
+
+
 @bare
-def _sum_runs(image, flags, labels, first, last, center, power, cross, energy, run):  # type: ignore[no-untyped-def]
+def _sum_channel(image, flags, row, start, stop, c, center, run):  # type: ignore[no-untyped-def]
+    """Sums of x^a s over the unflagged pixels of a run into run (5,); returns the sum of s^2."""
+    r0 = r1 = r2 = r3 = r4 = energy = 0.0
+    for col in range(start, stop):
+        x = (col - center) / UNIT_PX
+        v = np.float64(image[row, col, c]) * (flags[row, col] == 0)
+        energy += v * v
+        r0 += v
+        v *= x
+        r1 += v
+        v *= x
+        r2 += v
+        v *= x
+        r3 += v
+        v *= x
+        r4 += v
+    run[0] = r0
+    run[1] = r1
+    run[2] = r2
+    run[3] = r3
+    run[4] = r4
+    return energy
+
+
+@bare
+def _sum_three(image, flags, row, start, stop, c, center, runs, energy):  # type: ignore[no-untyped-def]
+    """The same for channels c, c + 1, c + 2 at once, up to x^2, into runs (3, 9); adds to energy (C,)."""
+    a0 = a1 = a2 = b0 = b1 = b2 = c0 = c1 = c2 = ea = eb = ec = 0.0
+    for col in range(start, stop):
+        weight = np.float64(flags[row, col] == 0)
+        x = (col - center) / UNIT_PX
+        u = np.float64(image[row, col, c]) * weight
+        v = np.float64(image[row, col, c + 1]) * weight
+        w = np.float64(image[row, col, c + 2]) * weight
+        ea += u * u
+        eb += v * v
+        ec += w * w
+        a0 += u
+        b0 += v
+        c0 += w
+        u *= x
+        v *= x
+        w *= x
+        a1 += u
+        b1 += v
+        c1 += w
+        a2 += u * x
+        b2 += v * x
+        c2 += w * x
+    energy[c] += ea
+    energy[c + 1] += eb
+    energy[c + 2] += ec
+    runs[0, 0] = a0
+    runs[0, 1] = a1
+    runs[0, 2] = a2
+    runs[1, 0] = b0
+    runs[1, 1] = b1
+    runs[1, 2] = b2
+    runs[2, 0] = c0
+    runs[2, 1] = c1
+    runs[2, 2] = c2
+
+
+@bare
+def _sum_runs(image, flags, labels, first, last, center, table, power, cross, energy, run):  # type: ignore[no-untyped-def]
     """One pass over rows: a run of one label is summed in x, then spread over powers of y.
 
-    run : (C + 1, 2k + 1) float64 scratch
+    table : `power_table`; run : (3, 9) float64 scratch
     """
     width, channels = image.shape[1], image.shape[2]
     top = power.shape[1]
     low = cross.shape[2]
+    middle = table.shape[0] // 2
     for row in range(first, last):
         col = 0
         while col < width:
             k = labels[row, col]
-            if k <= 0:
-                col += 1
-                continue
-            for c in range(channels + 1):
-                for a in range(top):
-                    run[c, a] = 0.0
+            start = col
+            flagged = 0
             while col < width and labels[row, col] == k:
-                if flags[row, col] == 0:
-                    x = (col - center[k, 0]) / UNIT_PX
-                    xa = 1.0
-                    for a in range(top):
-                        run[channels, a] += xa
-                        xa *= x
-                    for c in range(channels):
-                        v = np.float64(image[row, col, c])
-                        energy[k, c] += v * v
-                        for a in range(low):
-                            run[c, a] += v
-                            v *= x
+                flagged += flags[row, col] != 0
                 col += 1
+            if k <= 0 or flagged == col - start:
+                continue
+            origin = center[k, 0]
+            low_end = middle + np.int64(2 * (start - origin))
+            high_end = middle + np.int64(2 * (col - origin))
+            for a in range(top):
+                run[0, a] = table[high_end, a] - table[low_end, a]
+            if flagged > 0:
+                for j in range(start, col):
+                    if flags[row, j] != 0:
+                        x = (j - origin) / UNIT_PX
+                        xa = 1.0
+                        for a in range(top):
+                            run[0, a] -= xa
+                            xa *= x
             y = (row - center[k, 1]) / UNIT_PX
             for a in range(top):
-                value = run[channels, a]
+                value = run[0, a]
                 for b in range(top):
                     power[k, a, b] += value
                     value *= y
-            for c in range(channels):
-                for a in range(low):
-                    value = run[c, a]
-                    for b in range(low):
-                        cross[k, c, a, b] += value
-                        value *= y
+            c = 0
+            while c < channels:
+                count = 3 if low <= 3 and c + 3 <= channels else 1
+                if count == 3:
+                    _sum_three(image, flags, row, start, col, c, origin, run, energy[k])
+                else:
+                    energy[k, c] += _sum_channel(image, flags, row, start, col, c, origin, run[0])
+                for i in range(count):
+                    for a in range(low):
+                        value = run[i, a]
+                        for b in range(low):
+                            cross[k, c + i, a, b] += value
+                            value *= y
+                c += count
 
 
 def accumulate(
@@ -133,6 +226,7 @@ def accumulate(
     Parameters
     ----------
     image : (H, W, C) float32; flags : (H, W) uint8, non-zero leaves a pixel out; labels : (H, W) int32
+    degree : 1 to 4
     boxes : (count + 1, 4) int64, `region_boxes` where they are known
     """
     channels = image.shape[2]
@@ -142,10 +236,13 @@ def accumulate(
     power = np.zeros((BANDS, count + 1, top, top))
     cross = np.zeros((BANDS, count + 1, channels, degree + 1, degree + 1))
     energy = np.zeros((BANDS, count + 1, channels))
-    run = np.empty((BANDS, channels + 1, top))
+    run = np.empty((BANDS, 3, 9))
+    table = power_table(labels.shape[1])
 
     def sum_band(i: int, first: int, last: int) -> None:
-        _sum_runs(image, flags, labels, first, last, center, power[i], cross[i], energy[i], run[i])
+        _sum_runs(
+            image, flags, labels, first, last, center, table, power[i], cross[i], energy[i], run[i]
+        )  # fmt: skip
 
     over_bands(labels.shape[0], sum_band)
     return Moments(center, power.sum(axis=0), cross.sum(axis=0), energy.sum(axis=0))

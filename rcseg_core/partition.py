@@ -208,7 +208,7 @@ class Partition:
             self._pairs = self._pairs.relabelled(mapping)
 
     def add_leftovers(self, flags: NDArray[np.uint8], least: int) -> int:
-        """Measured unassigned pixels become regions where at least `least` hang together; returns how many."""
+        """Unassigned pixels become regions where at least `least` hang together; returns how many."""
         room = count_unassigned(self.labels, flags)
         if room == 0:
             return 0

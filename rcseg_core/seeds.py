@@ -9,17 +9,22 @@ med/chi2_{d,0.5} with the cut at chi2_{d,0.975}.
 
 from __future__ import annotations
 
+from functools import cache, partial
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from rcseg_core.config import SeedsConfig
-from rcseg_core.jit import kernel
+from rcseg_core.jit import bare, kernel
+from rcseg_core.parallel import BANDS, together
 from rcseg_core.signals import Signals, local_scales
 
 #: Windows beyond the largest of the paper, tried first and taken only where plain least squares leaves pure
 #: noise: fewer seeds to group on wide plain surfaces.
 WIDE_WINDOWS_PX = (31, 19)
+#: Least height of a band of rows that is filled on its own.
+BAND_PX = 100
 #: A seed must keep this share of its usable pixels as inliers (LMS breaks down at half).
 MIN_INLIERS = 0.5
 #: Three pixels span a plane; two more tell whether it fits.
@@ -242,14 +247,15 @@ def _try_window(  # type: ignore[no-untyped-def]
 
 @kernel
 def place_windows(  # type: ignore[no-untyped-def]
-    image, flags, edges, n_range, law, eps2_c, sizes, max_window, half, cut, robust, subsets, min_valid,
-    labels,
+    image, flags, edges, first, last, n_range, law, eps2_c, sizes, max_window, half, cut, robust, subsets,
+    min_valid, labels,
 ):  # fmt: skip
-    """Fill `labels` (H, W) int32 with seeds 1..N; returns N. Windows in raster order, sizes largest first.
+    """Fill rows first..last-1 of `labels` (H, W) int32 with seeds 1..N; returns N.
 
-    A window is free when each of its `size` columns ends a run of `size` rows without edge or seed.
+    Windows in raster order, sizes largest first. A window is free when each of its `size` columns ends a run
+    of `size` rows without edge or seed.
     """
-    height, width, channels = image.shape
+    width, channels = image.shape[1], image.shape[2]
     most = sizes[0] * sizes[0]
     work = (
         np.empty((most, 2 + channels)),
@@ -262,7 +268,7 @@ def place_windows(  # type: ignore[no-untyped-def]
     run = np.empty(width, np.int64)
     for size in sizes:
         run[:] = 0
-        for row in range(height):
+        for row in range(first, last):
             streak = 0
             for col in range(width):
                 free = edges[row, col] == 0 and labels[row, col] == 0
@@ -288,6 +294,20 @@ def place_windows(  # type: ignore[no-untyped-def]
                     for c in range(col0, col0 + size - size // 2):
                         run[c] = size // 2
     return count
+
+
+@bare
+def _renumber(labels, first, last, offset):  # type: ignore[no-untyped-def]
+    for row in range(first, last):
+        for col in range(labels.shape[1]):
+            if labels[row, col] > 0:
+                labels[row, col] += offset
+
+
+@cache
+def _chi2_cuts(dims: int) -> tuple[float, float]:
+    """chi2_{d,0.5} and chi2_{d,0.975}."""
+    return float(chi2.ppf(0.5, dims)), float(chi2.ppf(0.975, dims))
 
 
 def _fence(edges: NDArray[np.uint8], within: NDArray[np.int32]) -> NDArray[np.uint8]:
@@ -320,10 +340,21 @@ def initial_partition(
     if config.fit == "auto":
         wide = [w for w in WIDE_WINDOWS_PX if top < w <= min(labels.shape)]
         sizes = np.concatenate([np.array(wide, np.int64), sizes])
-    dims = signals.image.shape[2]
-    count = place_windows(
-        signals.image, signals.flags, blocked, signals.n_range, signals.law, signals.color_eps2, sizes, top,
-        float(chi2.ppf(0.5, dims)), float(chi2.ppf(0.975, dims)), config.fit == "lms", config.subsets,
-        config.min_valid, labels,
-    )  # fmt: skip
-    return labels, int(count)
+    cuts = _chi2_cuts(signals.image.shape[2])
+    # windows keep to bands of rows, which are filled side by side; the literal form knows none
+    bands = max(1, min(BANDS, labels.shape[0] // BAND_PX)) if config.fit == "auto" else 1
+    height = labels.shape[0]
+    rows = [height * i // bands for i in range(bands + 1)]
+    counts = [0] * bands
+
+    def place(i: int) -> None:
+        counts[i] = place_windows(
+            signals.image, signals.flags, blocked, rows[i], rows[i + 1], signals.n_range, signals.law,
+            signals.color_eps2, sizes, top, *cuts, config.fit == "lms", config.subsets, config.min_valid,
+            labels,
+        )  # fmt: skip
+
+    together(*(partial(place, i) for i in range(bands)))
+    for i in range(1, bands):
+        _renumber(labels, rows[i], rows[i + 1], sum(counts[:i]))
+    return labels, sum(counts)

@@ -158,7 +158,13 @@ def absorb_small(
     models = fit_models(moments, rule.degree[alive], signals.n_range)
     pairs = partition.pairs(edges, config.grouping.max_gap)
     grouped = continuous_pairs(
-        partition.labels, signals, models, pairs, curved_regions(moments, signals), rule.small
+        partition.labels,
+        signals,
+        models,
+        pairs,
+        curved_regions(moments, signals),
+        partition.sizes(),
+        rule.small,
     )
     if len(grouped.merges):
         partition.apply(grouped)

@@ -13,7 +13,7 @@ from rcseg_core.adjacency import Pairs, spread
 from rcseg_core.config import SegmenterConfig
 from rcseg_core.grouping import group
 from rcseg_core.moments import Moments
-from rcseg_core.partition import Partition, count_together
+from rcseg_core.partition import Partition, count_together, relabel
 from rcseg_core.signals import Signals
 from rcseg_core.stages import copied, make_rule
 
@@ -23,9 +23,7 @@ HOLE_PX = 4
 
 def bridge_holes(labels: NDArray[np.int32]) -> NDArray[np.int32]:
     """`labels` spread over small holes, so that missing pixels do not fence in the windows of colour."""
-    bridged, met = np.empty_like(labels), np.empty(labels.shape, np.uint8)
-    spread(labels, np.zeros(labels.shape, np.uint8), HOLE_PX, bridged, met)
-    return bridged
+    return spread(labels, np.zeros(labels.shape, np.uint8), HOLE_PX)[0]
 
 
 def _groups(grouped_count: int, merges: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -72,4 +70,6 @@ def number_surfaces(
     rank[order] = np.arange(1, order.size + 1)
     number = rank[surface_of]
     number[0] = 0
-    return number.astype(np.int32)[partition.labels], number
+    surface_labels = partition.labels.copy()
+    relabel(surface_labels, number.astype(np.int32))
+    return surface_labels, number
