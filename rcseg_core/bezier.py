@@ -6,6 +6,7 @@ in [0, 1]. Grouping works in centred monomials, where sums add; the conversion h
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from math import comb
@@ -42,12 +43,17 @@ def power_to_bernstein(degree: int) -> NDArray[np.float64]:
 
 def monomial_to_bernstein(degree: int, offset: float, span: float) -> NDArray[np.float64]:
     """(k+1, k+1) matrix from coefficients of x^i to Bernstein coefficients in t, x = offset + span t."""
-    powers = np.array(
-        [
-            [comb(i, m) * offset ** (i - m) * span**m if m <= i else 0.0 for i in range(degree + 1)]
-            for m in range(degree + 1)
-        ]
-    )
+    return np.asarray(monomials_to_bernstein(degree, np.array([offset]), np.array([span]))[0])
+
+
+def monomials_to_bernstein(
+    degree: int, offset: NDArray[np.float64], span: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """`monomial_to_bernstein` of n offsets and spans at once: (n, k+1, k+1)."""
+    powers = np.zeros((len(offset), degree + 1, degree + 1))
+    for i in range(degree + 1):
+        for m in range(i + 1):
+            powers[:, m, i] = comb(i, m) * offset ** (i - m) * span**m
     return np.asarray(power_to_bernstein(degree) @ powers)
 
 
@@ -110,11 +116,37 @@ class BezierPatch:
 
     def derivatives(self, row: float, col: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Derivatives per pixel along rows and along columns at one pixel, (channels,) each."""
-        row_min, col_min, row_max, col_max = self.domain
-        u, v = self.parameters(row, col)
-        k = self.degree
+        _, along_rows, along_cols = jets([self], np.array([float(row)]), np.array([float(col)]))
+        return along_rows[0], along_cols[0]
+
+
+def jets(
+    patches: Sequence[BezierPatch], rows: NDArray[Any], cols: NDArray[Any]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Values and derivatives per pixel, along rows and along columns, of n patches at one pixel each.
+
+    Parameters
+    ----------
+    patches : of one kind; degrees may differ
+    rows, cols : (n,) pixel of each
+
+    Returns
+    -------
+    three (n, channels) float64
+    """
+    channels = patches[0].control_points.shape[0] if patches else 0
+    value, along_u, along_v = (np.zeros((len(patches), channels)) for _ in range(3))
+    degrees = np.array([patch.degree for patch in patches], int)
+    for k in np.unique(degrees).tolist():
+        mine = np.nonzero(degrees == k)[0]
+        control = np.stack([patches[i].control_points for i in mine.tolist()])
+        domains = np.array([patches[i].domain for i in mine.tolist()], np.float64)
+        low_row, low_col, high_row, high_col = domains.T
+        wide, high = np.maximum(high_col - low_col, 1), np.maximum(high_row - low_row, 1)
+        u, v = (cols[mine] - low_col) / wide, (rows[mine] - low_row) / high
         bu, bv = bernstein(k, u), bernstein(k, v)
-        lower_u, lower_v = bernstein(k - 1, u), bernstein(k - 1, v)
-        along_u = k * np.einsum("cij,i,j->c", np.diff(self.control_points, axis=1), lower_u, bv)
-        along_v = k * np.einsum("cij,i,j->c", np.diff(self.control_points, axis=2), bu, lower_v)
-        return along_v / max(row_max - row_min, 1), along_u / max(col_max - col_min, 1)
+        value[mine] = np.einsum("ncij,ni,nj->nc", control, bu, bv)
+        by_u = np.einsum("ncij,ni,nj->nc", np.diff(control, axis=2), bernstein(k - 1, u), bv)
+        by_v = np.einsum("ncij,ni,nj->nc", np.diff(control, axis=3), bu, bernstein(k - 1, v))
+        along_u[mine], along_v[mine] = k * by_u / wide[:, None], k * by_v / high[:, None]
+    return value, along_v, along_u

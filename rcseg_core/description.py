@@ -6,14 +6,15 @@ Bernstein form on the region's box exactly.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rcseg_core.adjacency import Pairs
-from rcseg_core.bezier import BezierPatch, monomial_to_bernstein
-from rcseg_core.frame import RangeColorFrame
+from rcseg_core.bezier import BezierPatch, jets, monomials_to_bernstein
+from rcseg_core.frame import PinholeCamera, RangeColorFrame
 from rcseg_core.jit import kernel
 from rcseg_core.models import Models
 from rcseg_core.moments import UNIT_PX, Moments, tensor_exponents
@@ -68,79 +69,71 @@ def build_patches(
     kind = ("inverse_depth" if signals.inverse_depth else "xyz") if modality == 0 else "rgb"
     scale, offset = signals.scale[first:last], signals.offset[first:last]
     count = moments.energy.shape[0] - 1
+    domains = [tuple(box) for box in boxes.tolist()]
     patches: list[Any] = [None] * count
     for degree in np.unique(models.degree[1:, modality]):
         k = int(degree)
         p = (k + 1) ** 2
         members = np.nonzero(models.degree[1:, modality] == degree)[0] + 1
-        inverse = _inverse_grams(moments, members, k)
         terms = tensor_exponents(k)
-        for position, m in enumerate(members):
-            box = boxes[m]
-            bern_x, bern_y = _to_bernstein(k, moments.center[m], box)
-            local = models.coef[m, first:last, : k + 1, : k + 1]
-            control = np.einsum("ai,cij,bj->cab", bern_x, local, bern_y)
-            flat = local.reshape(last - first, p)
-            cross = moments.cross[m, first:last][:, terms[:, 0], terms[:, 1]]
-            energy = np.tril(products[m, first:last, first:last])
-            energy = energy + np.tril(energy, -1).T
-            # A R = V at the optimum, so the symmetrised (14) is T T^T - (A V^T + V A^T)/2
-            rest = energy - 0.5 * (flat @ cross.T + cross @ flat.T)
-            n = moments.power[m, 0, 0]
-            covariance = rest / max(n - p, 1.0)
-            spread = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-            np.fill_diagonal(covariance, spread**2)
-            lift = np.kron(bern_x, bern_y)
-            variance = np.einsum("ai,ij,aj->a", lift, inverse[position], lift)
-            with np.errstate(invalid="ignore"):
-                unit_error = np.sqrt(variance).reshape(k + 1, k + 1)
-            patches[m - 1] = BezierPatch(
-                kind=kind,
-                degree=k,
-                control_points=control * scale[:, None, None] + offset[:, None, None],
-                standard_errors=(spread * scale)[:, None, None] * unit_error,  # root of eq. (15)
-                covariance=covariance * scale[:, None] * scale[None, :],
-                domain=_box(box),
-            )
+        bern_x, bern_y = _to_bernstein(k, moments.center[members], boxes[members])
+        local = models.coef[members, first:last, : k + 1, : k + 1]
+        control = np.matmul(np.matmul(bern_x[:, None], local), bern_y[:, None].swapaxes(2, 3))
+        flat = local.reshape(members.size, last - first, p)
+        cross = moments.cross[members, first:last][:, :, terms[:, 0], terms[:, 1]]
+        lower = np.tril(products[members, first:last, first:last])
+        energy = lower + np.tril(lower, -1).swapaxes(1, 2)
+        # A R = V at the optimum, so the symmetrised (14) is T T^T - (A V^T + V A^T)/2
+        explained = np.matmul(flat, cross.swapaxes(1, 2))
+        rest = energy - 0.5 * (explained + explained.swapaxes(1, 2))
+        covariance = rest / np.maximum(moments.power[members, 0, 0] - p, 1.0)[:, None, None]
+        spread = np.sqrt(np.maximum(np.einsum("mcc->mc", covariance), 0.0))
+        np.einsum("mcc->mc", covariance)[:] = spread**2
+        lift = np.einsum("mai,mbj->mabij", bern_x, bern_y).reshape(members.size, p, p)
+        variance = (np.matmul(lift, _inverse_grams(moments, members, k)) * lift).sum(axis=2)
+        with np.errstate(invalid="ignore"):
+            unit_error = np.sqrt(variance).reshape(-1, 1, k + 1, k + 1)
+        errors = (spread * scale)[:, :, None, None] * unit_error  # root of eq. (15)
+        control = control * scale[:, None, None] + offset[:, None, None]
+        covariance = covariance * scale[:, None] * scale[None, :]
+        for i, m in enumerate(members.tolist()):
+            patches[m - 1] = BezierPatch(kind, k, control[i], errors[i], covariance[i], domains[m])
     return patches
-
-
-def _box(box: NDArray[np.int64]) -> tuple[int, int, int, int]:
-    """Row of a box array as plain integers."""
-    row_min, col_min, row_max, col_max = box.tolist()
-    return row_min, col_min, row_max, col_max
 
 
 def _to_bernstein(
     degree: int, center: NDArray[np.float64], box: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Conversion matrices of both axes from local monomials (x, y in UNIT_PX) to [0, 1] over the box."""
-    row_min, col_min, row_max, col_max = box
+    """(m, k+1, k+1) matrices of both axes from local monomials (x, y in UNIT_PX) to [0, 1] over the boxes."""
+    span = np.maximum(box[:, 2:] - box[:, :2], 1) / UNIT_PX
+    start = (box[:, :2] - center[:, ::-1]) / UNIT_PX
     return (
-        monomial_to_bernstein(degree, (col_min - center[0]) / UNIT_PX, max(col_max - col_min, 1) / UNIT_PX),
-        monomial_to_bernstein(degree, (row_min - center[1]) / UNIT_PX, max(row_max - row_min, 1) / UNIT_PX),
+        monomials_to_bernstein(degree, start[:, 1], span[:, 1]),
+        monomials_to_bernstein(degree, start[:, 0], span[:, 0]),
     )
 
 
-def _normal(patch: BezierPatch, row: float, col: float, frame: RangeColorFrame) -> NDArray[np.float64]:
-    """Unit normal of a range patch at a pixel, towards the sensor; NaN where the patch is degenerate."""
-    by_row, by_col = patch.derivatives(row, col)
-    if patch.kind == "inverse_depth":
-        camera = frame.camera
-        assert camera is not None
-        w = float(patch.evaluate(row, col)[0])
+def _normals(
+    patches: Sequence[BezierPatch], rows: NDArray[np.float64], cols: NDArray[np.float64],
+    camera: PinholeCamera | None,
+) -> NDArray[np.float64]:  # fmt: skip
+    """(n, 3) unit normals of range patches at one pixel each, towards the sensor; NaN where degenerate."""
+    values, by_row, by_col = jets(patches, rows, cols)
+    if camera is not None and patches and patches[0].kind == "inverse_depth":
         # tangent plane n.X = 1 with X = ray / w, so w = n.ray: linear in the pixel coordinates
-        nx, ny = by_col[0] * camera.fx, by_row[0] * camera.fy
-        ray = np.array([(col - camera.cx) / camera.fx, (row - camera.cy) / camera.fy, 1.0])
-        normal = np.array([nx, ny, w - nx * ray[0] - ny * ray[1]])
-        toward = -float(normal @ ray)
+        nx, ny = by_col[:, 0] * camera.fx, by_row[:, 0] * camera.fy
+        x, y = (cols - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy
+        nz = values[:, 0] - nx * x - ny * y
+        normals = np.stack([nx, ny, nz], axis=1)
+        toward = -(nx * x + ny * y + nz)
     else:
-        normal = np.cross(by_col, by_row)
-        toward = -float(normal[2])
-    length = float(np.linalg.norm(normal))
-    if length == 0.0:
-        return np.full(3, np.nan)
-    return normal / length * (1.0 if toward >= 0 else -1.0)
+        normals = np.cross(by_col, by_row)
+        toward = -normals[:, 2]
+    length = np.sqrt((normals * normals).sum(axis=1))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        normals = normals / length[:, None]
+    normals[length == 0.0] = np.nan
+    return np.asarray(np.where(toward[:, None] >= 0, normals, -normals))
 
 
 def describe_regions(
@@ -153,31 +146,30 @@ def describe_regions(
     centroid = np.zeros((count + 1, 4))
     products = np.zeros((count + 1, channels, channels))
     _sums(frame.points, signals.image, signals.flags, labels, signals.n_range, centroid, products)
-    sizes = np.bincount(labels.ravel(), minlength=count + 1)
     range_patches = build_patches(moments, models, boxes, products, signals, 0)
     color_patches = build_patches(moments, models, boxes, products, signals, 1)
     neighbors: list[list[int]] = [[] for _ in range(count + 1)]
-    for a, b in pairs.nodes:
-        neighbors[a].append(int(b))
-        neighbors[b].append(int(a))
-    regions = []
-    for k in range(1, count + 1):
-        with np.errstate(invalid="ignore", divide="ignore"):
-            middle = centroid[k, :3] / centroid[k, 3]
-        n = max(moments.power[k, 0, 0], 1.0)
-        col = moments.center[k, 0] + moments.power[k, 1, 0] / n * UNIT_PX
-        row = moments.center[k, 1] + moments.power[k, 0, 1] / n * UNIT_PX
-        regions.append(
-            Region(
-                label=k,
-                surface=int(surface_of[k]),
-                pixel_count=int(sizes[k]),
-                box=_box(boxes[k]),
-                centroid=middle,
-                normal=_normal(range_patches[k - 1], row, col, frame),
-                neighbors=tuple(sorted(neighbors[k])),
-                range_patch=range_patches[k - 1],
-                color_patch=color_patches[k - 1],
-            )
+    for a, b in pairs.nodes.tolist():
+        neighbors[a].append(b)
+        neighbors[b].append(a)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        middle = centroid[:, :3] / centroid[:, 3:]
+    n = np.maximum(moments.power[1:, 0, 0], 1.0)
+    cols = moments.center[1:, 0] + moments.power[1:, 1, 0] / n * UNIT_PX
+    rows = moments.center[1:, 1] + moments.power[1:, 0, 1] / n * UNIT_PX
+    normals = _normals(range_patches, rows, cols, frame.camera)
+    surfaces, sizes = surface_of.tolist(), np.bincount(labels.ravel(), minlength=count + 1).tolist()
+    return [
+        Region(
+            label=k,
+            surface=surfaces[k],
+            pixel_count=sizes[k],
+            box=range_patches[k - 1].domain,
+            centroid=middle[k],
+            normal=normals[k - 1],
+            neighbors=tuple(sorted(neighbors[k])),
+            range_patch=range_patches[k - 1],
+            color_patch=color_patches[k - 1],
         )
-    return regions
+        for k in range(1, count + 1)
+    ]

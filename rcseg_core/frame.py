@@ -132,10 +132,13 @@ class RangeColorFrame:
     @cached_property
     def valid(self) -> NDArray[np.bool_]:
         """(H, W) bool: finite points that a sensor can give; with a camera also in front of it."""
-        z = self.points[..., 2]
-        valid: NDArray[np.bool_] = np.isfinite(self.points).all(axis=2)
+        x, y, z = (self.points[..., axis] for axis in range(3))
+        # plane by plane: reducing over an axis of three takes ten times as long
+        valid: NDArray[np.bool_] = np.isfinite(x) & np.isfinite(y)
         if self.camera is None:
-            valid &= (z != 0) & (np.abs(self.points).max(axis=2) <= MAX_DEPTH_M)
+            valid &= z != 0
+            for plane in (x, y, z):
+                valid &= np.abs(plane) <= MAX_DEPTH_M
         else:
             valid &= (z >= MIN_DEPTH_M) & (z <= MAX_DEPTH_M)
         return valid

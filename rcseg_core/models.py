@@ -96,21 +96,3 @@ def pixel_cost(models, k, image, flags, row, col, n_range, law, color_eps2):  # 
             total += d * d
         cost += total / (1.0 + 0.25 * color_eps2 / (channels - n_range))
     return cost
-
-
-@bare
-def _render(models, labels, n_range, out):  # type: ignore[no-untyped-def]
-    height, width, channels = out.shape
-    for row in range(height):
-        for col in range(width):
-            k = labels[row, col]
-            if k > 0:
-                for c in range(channels):
-                    out[row, col, c] = predict(models, k, row, col, 0 if c < n_range else 1, c)
-
-
-def render(models: Models, labels: NDArray[np.int32], channels: int, n_range: int) -> NDArray[np.float32]:
-    """(H, W, channels) float32 whitened values of each pixel's model; 0 where unlabelled (eq. 1-2)."""
-    out = np.zeros((*labels.shape, channels), np.float32)
-    _render(models, labels, n_range, out)
-    return out

@@ -13,8 +13,9 @@ from rcseg_core.bezier import BezierPatch
 from rcseg_core.frame import PinholeCamera
 from rcseg_core.grouping import Grouped
 from rcseg_core.hierarchy import Hierarchy, TreeBuilder
-from rcseg_core.models import Models, render
+from rcseg_core.models import Models
 from rcseg_core.noise import NoiseModel
+from rcseg_core.rendering import render
 from rcseg_core.signals import Signals
 
 
@@ -129,10 +130,6 @@ class Segmentation:
         groups[self.labels == 0] = 0
         return compact(groups)
 
-    @cached_property
-    def _rendered(self) -> NDArray[np.float32]:
-        return render(self.models, self.labels, self.signals.image.shape[2], self.signals.n_range)
-
     def reconstruct(self) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
         """Range and colour from the parameters alone (eq. 1-2).
 
@@ -141,20 +138,7 @@ class Segmentation:
         points : (H, W, 3) float32, m; NaN where unlabelled or behind the camera
         color : (H, W, 3) uint8; 0 where unlabelled
         """
-        signals = self.signals
-        n = signals.n_range
-        scale, offset = signals.scale.astype(np.float32), signals.offset.astype(np.float32)
-        values = self._rendered
-        color = np.clip(np.rint(values[..., n:] * scale[n:] + offset[n:]), 0, 255).astype(np.uint8)
-        unlabelled = self.labels == 0
-        color[unlabelled] = 0
-        points = values[..., :n] * scale[:n] + offset[:n]
-        if signals.inverse_depth:
-            assert self.camera is not None
-            inverse = np.where(points[..., 0] > 0, points[..., 0], np.nan)
-            points = self.camera.rays(*self.labels.shape) / inverse[..., None]
-        points[unlabelled] = np.nan
-        return points.astype(np.float32), color
+        return render(self.models, self.labels, self.signals, self.camera)
 
 
 def _paired(first: NDArray[np.integer], second: NDArray[np.integer]) -> NDArray[np.int64]:

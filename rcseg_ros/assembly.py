@@ -52,7 +52,7 @@ def assemble_frame(
     color = None if image is None else decode_image(image)
     if not hasattr(range_message, "fields"):
         return _frame_from_depth(decode_depth(range_message), color, camera)
-    cloud = decode_cloud(range_message)
+    cloud = decode_cloud(range_message, with_color=color is None)
     in_grid = cloud.organized and (color is None or cloud.points.shape == color.shape)
     if in_grid and cloud_to_camera is None:
         return _frame_from_grid(cloud.points, cloud.color if color is None else color, camera)
@@ -98,7 +98,7 @@ def _frame_from_grid(
 
 def _check_grid(points: NDArray[np.float32], camera: CameraModel) -> None:
     """Refuse a cloud that another camera, or another coordinate frame, put into this grid."""
-    rows, cols = (axis.ravel()[::97] for axis in np.indices(points.shape[:2]))
+    rows, cols = np.divmod(np.arange(0, points.shape[0] * points.shape[1], 97), points.shape[1])
     sample = points[rows, cols].astype(np.float64)
     ahead = np.isfinite(sample).all(axis=1) & (sample[:, 2] != 0)
     if not ahead.any():

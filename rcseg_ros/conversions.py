@@ -195,10 +195,11 @@ class Cloud:
 _POINT_FIELD_TYPES = dict(enumerate(("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"), start=1))
 
 
-def decode_cloud(message: Any) -> Cloud:
+def decode_cloud(message: Any, *, with_color: bool = True) -> Cloud:
     """Points and colour of a PointCloud2: fields of any order, offset and type, any byte order and padding.
 
-    Colour comes from ``rgb`` or ``rgba`` (packed into a float32 or an integer) or from ``r``, ``g``, ``b``.
+    Colour comes from ``rgb`` or ``rgba`` (packed into a float32 or an integer) or from ``r``, ``g``, ``b``;
+    `with_color` False leaves it where it is.
 
     Raises
     ------
@@ -231,7 +232,7 @@ def decode_cloud(message: Any) -> Cloud:
     points = np.empty((*shape, 3), np.float32)
     for axis, name in enumerate("xyz"):
         points[..., axis] = column(name)
-    return Cloud(points, _cloud_color(fields, column, shape))
+    return Cloud(points, _cloud_color(fields, column, shape) if with_color else None)
 
 
 def _cloud_layout(message: Any) -> tuple[NDArray[np.uint8], tuple[int, int], tuple[int, int]]:
@@ -256,10 +257,8 @@ def _cloud_color(fields: dict[str, Any], column: Any, shape: tuple[int, int]) ->
     color = np.empty((*shape, 3), np.uint8)
     packed = next((name for name in ("rgb", "rgba") if name in fields), None)
     if packed is not None:
-        bits = column(packed, "u4")  # the float32 form is a bit pattern too, never a number
-        for channel, shift in enumerate((16, 8, 0)):
-            color[..., channel] = bits >> shift & 255
-        return color
+        bits = column(packed, "u4").astype("<u4")  # the float32 form is a bit pattern too, never a number
+        return cv2.cvtColor(bits.view(np.uint8).reshape(*shape, 4), cv2.COLOR_BGRA2RGB, color)
     if all(name in fields for name in "rgb"):
         for channel, name in enumerate("rgb"):
             color[..., channel] = column(name)

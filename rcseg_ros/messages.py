@@ -14,16 +14,24 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rcseg_core import RangeColorFrame, Segmentation
 from rcseg_ros.outputs import Make
+from rcseg_ros.patches import bernstein
 from rcseg_ros.region_statistics import region_statistics
 
 PATCH_KINDS = {"inverse_depth": 1, "xyz": 2, "rgb": 3}  # the constants of BezierPatch.msg
 
 
-def region_array(frame: RangeColorFrame, result: Segmentation, header: Any, make: Make) -> Any:
+def region_array(
+    frame: RangeColorFrame,
+    result: Segmentation,
+    header: Any,
+    make: Make,
+    surface: NDArray[np.float32] | None = None,
+) -> Any:
     """Build the RegionArray of one frame.
 
     Parameters
@@ -31,39 +39,42 @@ def region_array(frame: RangeColorFrame, result: Segmentation, header: Any, make
     frame, result : the input and what `segment` made of it
     header : a std_msgs/Header of the message library that `make` builds for
     make : callable(type name, **fields), `make_rcl` for rclpy
+    surface : (H, W, 3) points of the reconstruction, where it is at hand already
 
     Returns
     -------
     rcseg_msgs/RegionArray, as `make` builds it
     """
-    statistics = region_statistics(frame, result.labels, result.regions)
+    if surface is None:
+        surface, _ = result.reconstruct()
+    statistics = region_statistics(frame.color, result.labels, result.regions, surface)
     quaternions = Rotation.from_matrix(statistics.axes).as_quat() if len(result.regions) else np.empty((0, 4))
-    regions = []
-    for i, region in enumerate(result.regions):
-        pose = make(
-            "geometry_msgs/msg/Pose",
-            position=_xyz("Point", statistics.center[i], make),
-            orientation=make(
-                "geometry_msgs/msg/Quaternion", **dict(zip("xyzw", map(float, quaternions[i]), strict=True))
+    columns = zip(
+        result.regions, quaternions.tolist(), statistics.center.tolist(), statistics.size.tolist(),
+        statistics.mean_color.astype(np.float32), _range_sigmas(result), strict=True,
+    )  # fmt: skip
+    regions = [
+        make(
+            "rcseg_msgs/msg/Region",
+            label=region.label,
+            surface=region.surface,
+            pixel_count=region.pixel_count,
+            pixels=_pixel_box(region.box, make),
+            neighbors=np.array(region.neighbors, np.uint32),
+            centroid=_xyz("Point", region.centroid.tolist(), make),
+            normal=_xyz("Vector3", region.normal.tolist(), make),
+            extent_pose=make(
+                "geometry_msgs/msg/Pose",
+                position=_xyz("Point", center, make),
+                orientation=make("geometry_msgs/msg/Quaternion", **dict(zip("xyzw", turn, strict=True))),
             ),
+            extent_size=_xyz("Vector3", size, make),
+            mean_color=mean_color,
+            range_patch=_bezier_patch(region.range_patch, range_sigma, make),
+            color_patch=_bezier_patch(region.color_patch, result.noise.color, make),
         )
-        regions.append(
-            make(
-                "rcseg_msgs/msg/Region",
-                label=int(region.label),
-                surface=int(region.surface),
-                pixel_count=int(region.pixel_count),
-                pixels=_pixel_box(region.box, make),
-                neighbors=np.asarray(region.neighbors, np.uint32),
-                centroid=_xyz("Point", region.centroid, make),
-                normal=_xyz("Vector3", region.normal, make),
-                extent_pose=pose,
-                extent_size=_xyz("Vector3", statistics.size[i], make),
-                mean_color=statistics.mean_color[i].astype(np.float32),
-                range_patch=_bezier_patch(region.range_patch, _range_sigma(result.noise, region), make),
-                color_patch=_bezier_patch(region.color_patch, result.noise.color, make),
-            )
-        )
+        for region, turn, center, size, mean_color, range_sigma in columns
+    ]
     k = np.zeros((3, 3)) if frame.camera is None else frame.camera.matrix()
     return make(
         "rcseg_msgs/msg/RegionArray",
@@ -93,29 +104,40 @@ def _rcl_class(type_name: str) -> tuple[type, frozenset[str]]:
     return cls, frozenset(field for field, kind in kinds.items() if kind.startswith("sequence<"))
 
 
-def _xyz(kind: str, values: Any, make: Make) -> Any:
-    return make(f"geometry_msgs/msg/{kind}", **dict(zip("xyz", map(float, values), strict=True)))
+def _xyz(kind: str, values: list[float], make: Make) -> Any:
+    x, y, z = values
+    return make(f"geometry_msgs/msg/{kind}", x=x, y=y, z=z)
 
 
-def _pixel_box(box: Any, make: Make) -> Any:
-    names = ("row_min", "col_min", "row_max", "col_max")
-    return make("rcseg_msgs/msg/PixelBox", **dict(zip(names, map(int, box), strict=True)))
+def _pixel_box(box: tuple[int, int, int, int], make: Make) -> Any:
+    row_min, col_min, row_max, col_max = box
+    return make("rcseg_msgs/msg/PixelBox", row_min=row_min, col_min=col_min, row_max=row_max, col_max=col_max)
 
 
-def _range_sigma(noise: Any, region: Any) -> Any:
-    """Sensor noise per range channel at the region's centre: sigma(s) = a + b s + c s^2 of the signal s."""
-    patch = region.range_patch
-    row_min, col_min, row_max, col_max = patch.domain
-    center = patch.evaluate(np.array([(row_min + row_max) / 2]), np.array([(col_min + col_max) / 2]))[0]
-    return (noise.range_law * np.stack([np.ones_like(center), center, center**2], axis=1)).sum(axis=1)
+def _range_sigmas(result: Segmentation) -> list[NDArray[np.float64]]:
+    """Sensor noise per range channel at each region's centre: sigma(s) = a + b s + c s^2 of the signal s."""
+    patches = [region.range_patch for region in result.regions]
+    if not patches:
+        return []
+    center = np.empty((len(patches), len(patches[0].control_points)))
+    for degree in {patch.degree for patch in patches}:
+        mine = [i for i, patch in enumerate(patches) if patch.degree == degree]
+        low_row, low_col, high_row, high_col = np.array([patches[i].domain for i in mine]).T
+        # A domain of one row or column maps to 0.
+        u = bernstein(degree, np.where(high_col > low_col, 0.5, 0.0))
+        v = bernstein(degree, np.where(high_row > low_row, 0.5, 0.0))
+        control = np.stack([patches[i].control_points for i in mine])
+        center[mine] = np.einsum("ncij,ni,nj->nc", control, u, v)
+    powers = np.stack([np.ones_like(center), center, center**2], axis=2)
+    return list((result.noise.range_law * powers).sum(axis=2))
 
 
 def _bezier_patch(patch: Any, noise_sigma: Any, make: Make) -> Any:
     return make(
         "rcseg_msgs/msg/BezierPatch",
         kind=PATCH_KINDS[patch.kind],
-        degree=int(patch.degree),
-        channels=int(np.shape(patch.control_points)[0]),
+        degree=patch.degree,
+        channels=len(patch.control_points),
         domain=_pixel_box(patch.domain, make),
         control_points=_flat(patch.control_points),
         standard_errors=_flat(patch.standard_errors),
@@ -124,7 +146,7 @@ def _bezier_patch(patch: Any, noise_sigma: Any, make: Make) -> Any:
     )
 
 
-def _flat(values: Any) -> np.ndarray[Any, np.dtype[np.float64]]:
+def _flat(values: Any) -> NDArray[np.float64]:
     return np.ascontiguousarray(values, np.float64).ravel()
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -72,12 +73,12 @@ def cloud_message(
     points : (H, W, 3) metres, NaN where there is none; color : (H, W, 3) uint8; labels : (H, W), 0: none
     """
     height, width = labels.shape
-    cloud = np.empty((height, width), _CLOUD_DTYPE)
-    for axis, name in enumerate("xyz"):
-        cloud[name] = points[..., axis]
-    red, green, blue = (color[..., channel].astype(np.uint32) for channel in range(3))
-    cloud["rgb"] = red << 16 | green << 8 | blue
-    cloud["label"] = labels
+    cloud = np.empty((height, width, 5), "<f4")  # as _CLOUD_DTYPE says: all fields are four bytes wide
+    cloud[..., :3] = points
+    bits = cloud.view("<u4")
+    bgra = cv2.cvtColor(np.asarray(color, np.uint8), cv2.COLOR_RGB2BGRA)
+    bits[..., 3] = bgra.view("<u4")[..., 0] & 0xFFFFFF
+    bits[..., 4] = labels
     kinds = {"rgb": _FLOAT32, "label": _UINT32}
     fields = [
         make(

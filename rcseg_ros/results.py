@@ -37,8 +37,13 @@ class ResultMessages:
         return labels_message(self._result.surface_labels, self._header, self._make)
 
     @cached_property
+    def _surface_and_color(self) -> tuple[Any, Any]:
+        return self._result.reconstruct()
+
+    @cached_property
     def regions(self) -> Any:
-        return region_array(self._frame, self._result, self._header, self._make)
+        surface, _ = self._surface_and_color
+        return region_array(self._frame, self._result, self._header, self._make, surface)
 
     @cached_property
     def edges(self) -> Any:
@@ -55,5 +60,5 @@ class ResultMessages:
 
     @cached_property
     def reconstruction(self) -> Any:
-        points, color = self._result.reconstruct()
+        points, color = self._surface_and_color
         return cloud_message(points, color, self._result.labels, self._header, self._make)

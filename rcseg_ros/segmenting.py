@@ -30,7 +30,7 @@ class Output:
 
     topic: str
     type: str
-    data: bytes
+    data: bytes | memoryview
 
 
 @dataclass(frozen=True)

@@ -70,7 +70,7 @@ class FoxgloveViewer:
                 self._channels[output.topic] = self._foxglove.Channel(
                     f"{self._namespace}/{output.topic}", message_encoding="cdr", schema=schema
                 )
-            self._channels[output.topic].log(output.data, log_time=frame.stamp_ns)
+            self._channels[output.topic].log(bytes(output.data), log_time=frame.stamp_ns)
 
     def close(self) -> None:
         self._server.stop()

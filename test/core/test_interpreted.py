@@ -15,7 +15,7 @@ from rcseg_core.synthetic import make_scene
 #: Tests of kernels on small arrays; those of whole frames would take minutes without the compiler.
 KERNEL_TESTS = (
     "moments", "planes", "adjacency", "evidence", "grouping", "models", "continuity", "hierarchy", "cleaning",
-    "generalization", "partition",
+    "generalization", "partition", "rendering",
 )  # fmt: skip
 SLOW = "vga or noise_alone or null_hypothesis or pure_noise or many_small"
 

@@ -74,7 +74,7 @@ def test_levels_are_not_negative(result, level):
         result.labels_at(level)
 
 
-def test_reconstruction_is_made_once_and_the_same_each_time(result):
+def test_reconstruction_is_the_same_each_time(result):
     first, second = result.reconstruct(), result.reconstruct()
     assert np.array_equal(first[0], second[0], equal_nan=True)
     assert np.array_equal(first[1], second[1])

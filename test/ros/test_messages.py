@@ -142,7 +142,9 @@ def test_statistics_of_a_known_rectangle():
     points[::7, ::5] = 40.0  # impulses: the box goes round the surface
     frame = RangeColorFrame(points, np.full((60, 80, 3), (10, 20, 30), np.uint8))
     regions = [_region(1, control, (0, 0, 59, 39)), _region(2, control, (0, 40, 59, 79), measured=False)]
-    statistics = region_statistics(frame, labels, regions)
+    rows, cols = np.mgrid[:60, :80]
+    surface = regions[0].range_patch.evaluate(rows, cols)
+    statistics = region_statistics(frame.color, labels, regions, surface)
     np.testing.assert_allclose(statistics.size[0], (2.0, 1.0, 0.0), atol=1e-9)
     np.testing.assert_allclose(statistics.center[0], (0.3, -0.2, 4.0), atol=1e-9)
     np.testing.assert_allclose(abs(statistics.axes[0].T @ turn), np.eye(3), atol=1e-9)

@@ -1,0 +1,91 @@
+"""The image that the parameters stand for (eq. 1-2): the model of each pixel's region, in sensor units.
+
+A polynomial in x and y is one in x alone along a row, so its coefficients there are worked out once for each
+run of a label, and a pixel costs as many products as its model has degrees.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rcseg_core.frame import PinholeCamera
+from rcseg_core.jit import bare
+from rcseg_core.models import Models
+from rcseg_core.moments import UNIT_PX
+from rcseg_core.signals import Signals
+
+
+@bare
+def _along_row(models, k, row, n_range, line):  # type: ignore[no-untyped-def]
+    """line[c, a]: coefficient of x^a of channel c of region k in a row."""
+    y = (row - models.center[k, 1]) / UNIT_PX
+    for c in range(line.shape[0]):
+        degree = models.degree[k, 0 if c < n_range else 1]
+        for a in range(degree + 1):
+            part = 0.0
+            for b in range(degree, -1, -1):
+                part = part * y + models.coef[k, c, a, b]
+            line[c, a] = part
+
+
+@bare
+def _render(models, labels, n_range, scale, offset, lens, line, points, color):  # type: ignore[no-untyped-def]
+    """Fill points and color; lens: (fx, fy, cx, cy) where range channel 0 is inverse depth, else fx = 0."""
+    height, width = labels.shape
+    channels = line.shape[0]
+    for row in range(height):
+        known = 0
+        for col in range(width):
+            k = labels[row, col]
+            if k <= 0:
+                for c in range(3):
+                    points[row, col, c] = np.nan
+                    color[row, col, c] = 0
+                continue
+            if k != known:
+                _along_row(models, k, row, n_range, line)
+                known = k
+            x = (col - models.center[k, 0]) / UNIT_PX
+            for c in range(channels):
+                value = 0.0
+                for a in range(models.degree[k, 0 if c < n_range else 1], -1, -1):
+                    value = value * x + line[c, a]
+                value = value * scale[c] + offset[c]
+                if c >= n_range:
+                    color[row, col, c - n_range] = np.uint8(min(max(np.rint(value), 0.0), 255.0))
+                elif lens[0] == 0.0:
+                    points[row, col, c] = value
+                else:
+                    depth = 1.0 / value if value > 0.0 else np.nan
+                    points[row, col, 0] = (col - lens[2]) / lens[0] * depth
+                    points[row, col, 1] = (row - lens[3]) / lens[1] * depth
+                    points[row, col, 2] = depth
+
+
+def render(
+    models: Models, labels: NDArray[np.int32], signals: Signals, camera: PinholeCamera | None
+) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """Points and colours of every pixel's model.
+
+    Parameters
+    ----------
+    models : of regions 1..N, whitened by `signals`
+    labels : (H, W) int32, 0 unlabelled
+    camera : needed where the range signal is inverse depth
+
+    Returns
+    -------
+    points : (H, W, 3) float32, m; NaN where unlabelled or where the model lies behind the camera
+    color : (H, W, 3) uint8, clipped to 0..255; 0 where unlabelled
+    """
+    channels = signals.scale.size
+    lens = np.zeros(4)
+    if signals.inverse_depth:
+        assert camera is not None
+        lens[:] = camera.fx, camera.fy, camera.cx, camera.cy
+    points = np.empty((*labels.shape, 3), np.float32)
+    color = np.empty((*labels.shape, 3), np.uint8)
+    line = np.empty((channels, models.coef.shape[2]))
+    _render(models, labels, signals.n_range, signals.scale, signals.offset, lens, line, points, color)
+    return points, color
