@@ -8,7 +8,7 @@ figures mean something: whole objects (a region may be a part of one) or the reg
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from fnmatch import fnmatch
@@ -46,6 +46,8 @@ class LabelledFrame:
         Labels of an "objects" truth that are support or background rather than objects.
     has_color : bool
         False when the frame came without colour and is a plain grey.
+    surface_truth : (H, W) int32 or None
+        Truth of the surfaces where `truth` splits them by colour.
     """
 
     name: str
@@ -54,6 +56,11 @@ class LabelledFrame:
     kind: str = OBJECTS
     background: tuple[int, ...] = ()
     has_color: bool = True
+    surface_truth: NDArray[np.int32] | None = None
+
+    def truth_of(self, level: str) -> NDArray[np.int32] | None:
+        """What "regions" or "surfaces" are compared with; None without truth."""
+        return self.surface_truth if level == "surfaces" and self.surface_truth is not None else self.truth
 
 
 def find_frames(folder: str | Path, pattern: str = "*") -> list[tuple[str, Path]]:
@@ -72,6 +79,25 @@ def find_frames(folder: str | Path, pattern: str = "*") -> list[tuple[str, Path]
         No such path, or no frame in it, or none that matches; the message lists what there is.
     """
     root = Path(folder)
+    frames = list_frames(root)
+    if not frames:
+        raise InputError(
+            f"{root}: no frame here; a frame is a folder with meta.json and depth.png, or an .npz file"
+        )
+    chosen = [(name, path) for name, path in frames if matches(name, pattern)]
+    if not chosen:
+        raise no_match(root, pattern, [name for name, _ in frames])
+    return chosen
+
+
+def list_frames(root: Path) -> list[tuple[str, Path]]:
+    """Names and paths of all frames in a folder, sorted by name; a single frame is a list of one.
+
+    Raises
+    ------
+    InputError
+        No such path.
+    """
     if not root.exists():
         raise InputError(
             f"{root}: no such file or folder; give a frame folder, an .npz file or a folder of them"
@@ -79,16 +105,18 @@ def find_frames(folder: str | Path, pattern: str = "*") -> list[tuple[str, Path]
     if root.is_file() or (root / "meta.json").exists():
         return [(root.stem if root.is_file() else root.name, root)]
     paths = [path.parent for path in root.rglob("meta.json")] + list(root.rglob("*.npz"))
-    frames = sorted((path.relative_to(root).with_suffix("").as_posix(), path) for path in paths)
-    if not frames:
-        raise InputError(
-            f"{root}: no frame here; a frame is a folder with meta.json and depth.png, or an .npz file"
-        )
-    chosen = [(name, path) for name, path in frames if fnmatch(name, pattern) or fnmatch(path.name, pattern)]
-    if not chosen:
-        names = ", ".join(name for name, _ in frames[:12]) + (", ..." if len(frames) > 12 else "")
-        raise InputError(f"{root}: no frame matches {pattern!r}; there are {names}")
-    return chosen
+    return sorted((path.relative_to(root).with_suffix("").as_posix(), path) for path in paths)
+
+
+def matches(name: str, pattern: str) -> bool:
+    """Does a glob match a frame's name, or the last part of it?"""
+    return fnmatch(name, pattern) or fnmatch(name.rpartition("/")[2], pattern)
+
+
+def no_match(root: Path, pattern: str, names: Sequence[str]) -> InputError:
+    """The error that tells which frames there are instead."""
+    there = ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
+    return InputError(f"{root}: no frame matches {pattern!r}; there are {there}")
 
 
 def load_frames(folder: str | Path, pattern: str = "*") -> Iterator[LabelledFrame]:

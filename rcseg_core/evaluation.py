@@ -22,16 +22,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rcseg_core import agreement
+from rcseg_core.blobs import find_blobs
 from rcseg_core.datasets import REGIONS
 from rcseg_core.errors import InputError
 from rcseg_core.hoover import TOLERANCES, contingency, sweep
 from rcseg_core.metrics import LabelMetrics, PartMetrics, ReconstructionMetrics, SceneMetrics
 
 if TYPE_CHECKING:
+    from rcseg_core.blobs import Blob
     from rcseg_core.datasets import LabelledFrame
+    from rcseg_core.frame import RangeColorFrame
     from rcseg_core.synthetic import SyntheticScene
 
 LEAST_AREA_SHARE = 100 / (640 * 480)
+LEAST_BLOB_PX = 25
+"""In small images fewer pixels make no blob: too few to say whether a model explains them."""
 
 
 class HasLabels(Protocol):
@@ -202,6 +207,8 @@ def evaluate_scene(
         name=f"{scene.family}_{scene.seed:03d}",
         regions=int(np.count_nonzero(np.bincount(machine.ravel())[1:])),
         labelled=float(np.mean(machine[valid] > 0)),
+        level=level,
+        blobs=_blobs(machine, scene.frame, level),
         labels=labels,
         reconstruction=reconstruction,
     )
@@ -217,30 +224,36 @@ def evaluate_frame(
 ) -> SceneMetrics:
     """The figures that the truth of a recorded frame allows: Hoover's for regions, parts for objects.
 
-    Without truth only the number of regions and the labelled share are given.
+    Without truth the number of regions, the labelled share and, of surfaces, the false blobs are given.
 
     Raises
     ------
     InputError
         Unknown level, or as `evaluate_labels` and `evaluate_parts`.
     """
-    machine = choose_labels(result, level)
+    machine, truth = choose_labels(result, level), frame.truth_of(level)
     valid, labels, parts = frame.frame.valid, None, None
-    if frame.truth is not None and frame.kind == REGIONS:
-        labels = evaluate_labels(
-            frame.truth, machine, mask=valid, tolerances=tolerances, minimum_area=minimum_area
-        )
-    elif frame.truth is not None:
+    if truth is not None and frame.kind == REGIONS:
+        labels = evaluate_labels(truth, machine, mask=valid, tolerances=tolerances, minimum_area=minimum_area)
+    elif truth is not None:
         parts = evaluate_parts(
-            frame.truth, machine, mask=valid, background=frame.background, minimum_area=minimum_area
+            truth, machine, mask=valid, background=frame.background, minimum_area=minimum_area
         )
     return SceneMetrics(
         name=frame.name,
         regions=int(np.count_nonzero(np.bincount(machine.ravel())[1:])),
         labelled=float(np.mean(machine[valid] > 0)),
+        level=level,
+        blobs=_blobs(machine, frame.frame, level),
         labels=labels,
         parts=parts,
     )
+
+
+def _blobs(machine: NDArray[np.int32], frame: RangeColorFrame, level: str) -> tuple[Blob, ...] | None:
+    """False blobs among surfaces; regions are split by colour, so theirs would say nothing."""
+    least = max(least_area(machine.shape), LEAST_BLOB_PX)
+    return find_blobs(machine, frame, least) if level == "surfaces" else None
 
 
 def choose_labels(result: HasLabels, level: str) -> NDArray[np.int32]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from rcseg_core.blobs import Blob
 from rcseg_core.errors import InputError
 from rcseg_core.hoover import HooverResult
 
@@ -123,12 +124,16 @@ class ReconstructionMetrics:
 class SceneMetrics:
     """All figures of one frame; None where its truth does not allow them.
 
-    `regions`: machine regions in the image; `labelled`: share of the valid pixels that carry a label.
+    `level`: what was judged, "regions" or "surfaces"; `regions`: machine regions of that level in the image;
+    `labelled`: share of the valid pixels that carry a label; `blobs`: surfaces inside of larger ones that
+    explain them (`find_blobs`), judged on surfaces only.
     """
 
     name: str
     regions: int
     labelled: float
+    level: str = "regions"
+    blobs: tuple[Blob, ...] | None = None
     labels: LabelMetrics | None = None
     parts: PartMetrics | None = None
     reconstruction: ReconstructionMetrics | None = None
@@ -136,6 +141,11 @@ class SceneMetrics:
     def figures(self) -> dict[str, float]:
         """All figures but Hoover's classes, by name."""
         found = {"regions": float(self.regions), "labelled": self.labelled}
+        if self.blobs is not None:
+            found |= {
+                "blobs": float(len(self.blobs)),
+                "blob_px": float(sum(b.pixel_count for b in self.blobs)),
+            }
         if self.labels is not None:
             keys = ("crumbs", "voi_bits", "rand", "adjusted_rand", "covering", "coverage")
             found |= {key: float(getattr(self.labels, key)) for key in keys}
@@ -146,7 +156,7 @@ class SceneMetrics:
 
     def row(self, tolerance: float = REPORT_TOLERANCE) -> dict[str, Any]:
         """Flat name -> number for tables and CSV files, with Hoover's classes at one tolerance."""
-        row: dict[str, Any] = {"frame": self.name}
+        row: dict[str, Any] = {"frame": self.name, "labels": self.level}
         if self.labels is not None:
             row |= self.labels.at(tolerance).counts()
         return row | self.figures()

@@ -17,10 +17,11 @@ class Pooled:
 
     `counts` holds, for each tolerance, the sums of truth regions, correct, over, under, missed and noise;
     `means` the average of every other figure over the frames that have it (NaN left out), per-object
-    figures weighted by objects.
+    figures weighted by objects. `level` is what was judged, "regions" or "surfaces".
     """
 
     name: str
+    level: str
     frames: int
     counts: dict[float, dict[str, int]]
     means: dict[str, float]
@@ -31,7 +32,7 @@ class Pooled:
         return counts["correct"] / counts["truth_regions"] if counts else float("nan")
 
     def row(self, tolerance: float = REPORT_TOLERANCE) -> dict[str, Any]:
-        row: dict[str, Any] = {"name": self.name, "frames": self.frames}
+        row: dict[str, Any] = {"name": self.name, "labels": self.level, "frames": self.frames}
         if tolerance in self.counts:
             row |= {"correct_share": self.correct(tolerance), **self.counts[tolerance]}
         return row | self.means
@@ -41,7 +42,7 @@ _PER_OBJECT = ("parts_per_object", "raw_parts_per_object", "best_iou")
 
 
 def pool(name: str, scenes: Sequence[SceneMetrics]) -> Pooled:
-    """Pool the figures of frames; see `Pooled`."""
+    """Pool the figures of frames that were judged on the same level; see `Pooled`."""
     counts: dict[float, dict[str, int]] = {}
     for scene in scenes:
         for result in scene.labels.hoover if scene.labels else ():
@@ -59,4 +60,4 @@ def pool(name: str, scenes: Sequence[SceneMetrics]) -> Pooled:
         key: float(np.average([v for v, _ in pairs], weights=[w for _, w in pairs]))
         for key, pairs in values.items()
     }
-    return Pooled(name, len(scenes), counts, means)
+    return Pooled(name, scenes[0].level if scenes else "", len(scenes), counts, means)

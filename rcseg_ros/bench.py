@@ -158,7 +158,7 @@ class BenchReport:
 
 def parse_sizes(text: str) -> tuple[tuple[int, int], ...]:
     """Sizes from `160x120,640x480`; errors as `parse_size`."""
-    from rcseg_ros.evaluate import parse_size
+    from rcseg_ros.evaluate_options import parse_size
 
     return tuple(dict.fromkeys(parse_size(part.strip()) for part in text.split(",")))
 

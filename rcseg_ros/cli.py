@@ -164,11 +164,14 @@ def config(
 
 @app.command(
     epilog="Examples: `rcseg evaluate synthetic --families room,blocks --seeds 100-109` or "
-    "`rcseg evaluate FRAMES --match 'mosd_*' --labels surfaces`"
+    "`rcseg evaluate DATA --match 'mosd_*' --labels surfaces`"
 )
 def evaluate(
     dataset: Annotated[
-        str, typer.Argument(help="`synthetic`, one frame, or a folder of frames.", show_default=False)
+        str,
+        typer.Argument(
+            help="`synthetic`, or a frame, a recording, or a folder of such, mixed.", show_default=False
+        ),
     ],
     output: Annotated[
         Optional[Path],  # noqa: UP045
@@ -186,18 +189,37 @@ def evaluate(
         bool, typer.Option("--structured-light", help="See synthetic frames as a Kinect would.")
     ] = False,
     match: Annotated[str, typer.Option(metavar="GLOB", help="Names of the recorded frames.")] = "*",
-    labels: Annotated[str, typer.Option(help="What is judged: regions or surfaces.")] = "regions",
+    labels: Annotated[
+        str,
+        typer.Option(
+            help="What is judged: regions, surfaces or both; auto: regions of scenes, both of data."
+        ),
+    ] = "auto",
     tolerance: Annotated[float, typer.Option(help="Overlap of the tables, above 0.5.")] = 0.8,
-    pictures: Annotated[bool, typer.Option(help="Write one picture a frame.")] = True,
+    pictures: Annotated[bool, typer.Option(help="Write a sheet for each frame, and a page.")] = True,
     tables_only: Annotated[bool, typer.Option("--tables-only", help="Write no files.")] = False,
+    check: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(metavar="FILE", help="Compare with this reference; exit code 1 when worse."),
+    ] = None,
+    write_reference: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(
+            "--write-reference", metavar="FILE", help="Make, or renew, the reference with these figures."
+        ),
+    ] = None,
     force: Force = False,
 ) -> None:
     """Compare with truth: Hoover's classes, information, parts, reconstruction; tables, files, pictures."""
-    from rcseg_ros.evaluate import SyntheticOptions, parse_families, parse_seeds, parse_size, run_evaluate
+    from rcseg_ros.evaluate import run_evaluate
+    from rcseg_ros.evaluate_options import SyntheticOptions, parse_families, parse_seeds, parse_size
+    from rcseg_ros.references import read_reference
     from rcseg_ros.settings import load_config
-    from rcseg_ros.terminal import CONSOLE, prepare
+    from rcseg_ros.terminal import CONSOLE, prepare, report_faults
 
     settings = load_config(config, set_ or (), preset)
+    file = check or write_reference
+    reference = read_reference(file) if file is not None and (check or file.exists()) else None
     folder = output or Path(f"{Path(dataset).absolute().stem}_evaluation")
     scenes = SyntheticOptions(
         parse_families(families, structured_light=structured_light),
@@ -207,7 +229,7 @@ def evaluate(
         dropout,
         structured_light,
     )
-    run_evaluate(
+    report = run_evaluate(
         dataset,
         config=settings,
         console=CONSOLE,
@@ -219,7 +241,9 @@ def evaluate(
         tolerance=tolerance,
         match=match,
         pictures=pictures,
+        reference=reference,
     )
+    raise typer.Exit(report_faults(report, reference, check, write_reference))
 
 
 @app.command(epilog="Examples: `rcseg bench -o bench` or `rcseg bench --frames FOLDER --threads all`")
@@ -257,7 +281,7 @@ def bench(
 ) -> None:
     """Measure speed by stage, memory and first labels, beside other segmenters in the same run."""
     from rcseg_ros.bench import BenchOptions, parse_sizes, parse_threads
-    from rcseg_ros.evaluate import parse_families, parse_seeds
+    from rcseg_ros.evaluate_options import parse_families, parse_seeds
     from rcseg_ros.settings import load_config
     from rcseg_ros.terminal import run_bench
 

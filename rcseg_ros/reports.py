@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Sequence
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
@@ -39,10 +39,13 @@ COLUMNS = {
     "parts_per_object": ("parts", ".2f"),
     "raw_parts_per_object": ("raw", ".1f"),
     "best_iou": ("IoU", ".3f"),
-    "regions": ("regions", ".0f"),
-    "ms": ("ms", ".0f"),
+    "regions": ("count", ".0f"),
+    "labelled": ("labelled", ".3f"),
+    "blobs": ("blobs", ".3g"),
+    "milliseconds": ("ms", ".0f"),
 }
 """What the tables on the screen show, in order: figure, head, format; files hold all figures."""
+KINDS = {"labels": "truth of regions", "parts": "truth of objects", "alone": "without truth"}
 TABLE_WIDTH = 130
 LEGEND = {
     "n": "frames",
@@ -57,45 +60,94 @@ LEGEND = {
     "parts": "parts per object, crumbs by area",
     "raw": "regions per object",
     "IoU": "best IoU per object",
+    "count": "machine regions",
+    "labelled": "share of the valid pixels with a label",
+    "blobs": "surfaces of 100 px and more inside of one that explains them",
 }
 """Heads that do not explain themselves."""
 
 
 def print_report(report: Report, console: Console, tolerance: float) -> None:
-    """The table by frame, the pooled one, and what their heads mean."""
+    """Tables by frame and pooled, one for each level and kind of truth, and what their heads mean."""
     if not report.frames:
         return
     if console.width < TABLE_WIDTH:  # a pipe or a narrow window: long lines are better than cut figures
         console = Console(file=console.file, width=TABLE_WIDTH, highlight=False)
-    rows = [
-        {**metrics.row(tolerance), "ms": 1e3 * seconds}
-        for metrics, seconds in zip(report.frames, report.seconds, strict=True)
-    ]
-    pooled = [
-        {**group.row(tolerance), "ms": float(np.median(report.milliseconds(group.name)))}
-        for group in report.pooled
-    ]
-    title = f"Pooled, overlap {tolerance:g}: counts are sums, ms the median, the rest means"
-    by_frame = _table(f"By frame, overlap {tolerance:g}", rows, "frame")
-    for table in (by_frame, _table(title, pooled, "name")):
-        console.print(table)
-    shown = {head for key, (head, _) in COLUMNS.items() if any(key in row for row in [*rows, *pooled])}
-    console.print("; ".join(f"{head}: {meaning}" for head, meaning in LEGEND.items() if head in shown))
+    sections = _sections(report, tolerance)
+    for title, frames, pooled in sections:
+        console.print(_table(title, frames, pooled))
+    shown = {head for _, frames, pooled in sections for head, _ in _columns([*frames, *pooled]).values()}
+    legend = "; ".join(f"{head}: {meaning}" for head, meaning in LEGEND.items() if head in shown)
+    console.print(f"Pooled: counts are sums, ms the median, the rest means. {legend}")
 
 
-def _table(title: str, rows: Sequence[dict[str, Any]], name: str) -> Table:
-    """A table of the columns that some row has a value for."""
-    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+def page_tables(report: Report, tolerance: float) -> str:
+    """The same tables as HTML, frame names linked to their headings."""
+    return "\n".join(
+        f"<h2>{escape(title)}</h2>{_html_table(frames, pooled)}"
+        for title, frames, pooled in _sections(report, tolerance)
+    )
+
+
+Rows = list[dict[str, Any]]
+
+
+def _sections(report: Report, tolerance: float) -> list[tuple[str, Rows, Rows]]:
+    """Title, rows of frames and rows of groups for each level and kind of truth that occurs."""
+    frames, pooled = report.frame_rows(tolerance), report.pooled_rows(tolerance)
+    sections = []
+    for level in report.levels:
+        for kind, name in KINDS.items():
+            own = [row for row in frames if row["labels"] == level and _kind(row) == kind]
+            groups = [row for row in pooled if row["labels"] == level and _kind(row) == kind]
+            if own:
+                title = f"{level.capitalize()}, {name}"
+                sections.append((title + f", overlap {tolerance:g}" * (kind == "labels"), own, groups))
+    return sections
+
+
+def _kind(row: dict[str, Any]) -> str:
+    return "labels" if "truth_regions" in row else "parts" if "purity" in row else "alone"
+
+
+def _columns(rows: Rows) -> dict[str, tuple[str, str]]:
+    """The columns that some row has a value for."""
     shown = {key: column for key, column in COLUMNS.items() if any(key in row for row in rows)}
     if "truth_regions" in shown or "purity" in shown:
-        del shown["regions"]
-    table.add_column(name, no_wrap=True)
-    for head, _ in shown.values():
+        for key in ("regions", "labelled"):
+            del shown[key]
+    return shown
+
+
+def _cells(row: dict[str, Any], columns: dict[str, tuple[str, str]]) -> list[str]:
+    return [format(row[key], form) if key in row else "" for key, (_, form) in columns.items()]
+
+
+def _table(title: str, frames: Rows, pooled: Rows) -> Table:
+    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    columns = _columns([*frames, *pooled])
+    table.add_column("frame", no_wrap=True, min_width=max(len(str(row["frame"])) for row in frames))
+    for head, _ in columns.values():
         table.add_column(head, justify="right", no_wrap=True)
-    for row in rows:
-        cells = [format(row[key], form) if key in row else "" for key, (_, form) in shown.items()]
-        table.add_row(str(row[name]), *cells)
+    for row in frames:
+        table.add_row(str(row["frame"]), *_cells(row, columns))
+    table.add_section()
+    for row in pooled:
+        table.add_row(str(row["name"]), *_cells(row, columns))
     return table
+
+
+def _html_table(frames: Rows, pooled: Rows) -> str:
+    columns = _columns([*frames, *pooled])
+    heads = "".join(f"<th>{escape(head)}</th>" for head in ["frame", *(h for h, _ in columns.values())])
+    lines = [(f'<a href="#{escape(row["frame"])}">{escape(row["frame"])}</a>', row) for row in frames] + [
+        (f"<b>{escape(row['name'])}, pooled</b>", row) for row in pooled
+    ]
+    body = "".join(
+        f"<tr><td>{name}</td>{''.join(f'<td>{cell}</td>' for cell in _cells(row, columns))}</tr>\n"
+        for name, row in lines
+    )
+    return f"<table><tr>{heads}</tr>\n{body}</table>"
 
 
 def write_csv(path: Path, rows: Sequence[dict[str, Any]]) -> None:
@@ -114,10 +166,12 @@ def plot_correct(path: Path, pooled: Sequence[Pooled]) -> None:
 
     figure = Figure(figsize=(7, 4.5), layout="constrained")
     axes = figure.subplots()
+    several = len({group.level for group in pooled}) > 1
     for group in pooled:
         if group.counts:
             tolerances = sorted(group.counts)
-            axes.plot(tolerances, [group.correct(t) for t in tolerances], marker="o", label=group.name)
+            name = f"{group.name}, {group.level}" if several else group.name
+            axes.plot(tolerances, [group.correct(t) for t in tolerances], marker="o", label=name)
     axes.set(xlabel="overlap tolerance", ylabel="correct detections / truth regions", ylim=(0, 1.02))
     axes.grid(alpha=0.3)
     axes.legend()

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from statistics import median
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -18,12 +18,16 @@ from rcseg_core.errors import InputError
 from rcseg_ros.bench import BenchOptions
 from rcseg_ros.bench import run_bench as bench
 from rcseg_ros.bench_report import BENCH, print_bench, write_bench
+from rcseg_ros.references import Reference, write_reference
 from rcseg_ros.replay import ReplayRequest, ReplaySummary, replay
 from rcseg_ros.settings import bounds
 from rcseg_ros.staging import StagedFolder
 from rcseg_ros.view import Viewer, ViewRequest, view
 from rcseg_ros.viewers import FoxgloveViewer, PageViewer
 from rcseg_ros.warmup import warm_up
+
+if TYPE_CHECKING:
+    from rcseg_ros.evaluate import Report
 
 INTERRUPTED = 130  # exit code after Ctrl-C
 CONSOLE = Console(highlight=False)
@@ -51,6 +55,20 @@ def run_replay(request: ReplayRequest) -> int:
         saved = f"{_count(len(summary.frames), 'frame')} before it written to {request.output}"
         raise InputError(f"{'; '.join(summary.damage)}; {saved}")
     return 0
+
+
+def report_faults(report: Report, reference: Reference | None, check: Path | None, renew: Path | None) -> int:
+    """Say where an evaluation is worse than its reference, and renew the file; return the exit code."""
+    faults = {} if reference is None else reference.faults(report)
+    for name, texts in faults.items():
+        for text in texts:
+            CONSOLE.print(f"{name}: {text}", soft_wrap=True)
+    if check is not None and not faults:
+        CONSOLE.print(f"Nothing is worse than {check} says.")
+    if renew is not None:
+        write_reference(renew, report)
+        CONSOLE.print(f"Figures written to {renew}.")
+    return 1 if check is not None and faults else 0
 
 
 def run_view(request: ViewRequest, host: str, port: int, foxglove_port: int | None) -> int:

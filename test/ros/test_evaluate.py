@@ -12,7 +12,8 @@ import rcseg_ros.evaluate as evaluate
 from rcseg_core import SegmenterConfig
 from rcseg_core.errors import InputError
 from rcseg_core.synthetic import FAMILIES, make_scene
-from rcseg_ros.evaluate import SyntheticOptions, parse_families, parse_seeds, parse_size, run_evaluate
+from rcseg_ros.evaluate import run_evaluate
+from rcseg_ros.evaluate_options import SyntheticOptions, parse_families, parse_level, parse_seeds, parse_size
 
 SMALL = SyntheticOptions(families=("room", "painting"), seeds=(0, 1), width=160, height=120)
 
@@ -46,7 +47,7 @@ def test_a_run_writes_figures_plot_and_pictures(tmp_path, console):
         assert row["depth_error_sigmas"] == pytest.approx(np.mean([f["depth_error_sigmas"] for f in frames]))
     assert document["settings"]["synthetic"]["seeds"] == [0, 1]
     assert document["config"] == json.loads(json.dumps(SegmenterConfig().to_dict()))
-    assert set(document["correct_over_tolerance"]["room"]) >= {"0.51", "0.8", "0.95"}
+    assert set(document["correct_over_tolerance"]["regions"]["room"]) >= {"0.51", "0.8", "0.95"}
     with (output / "frames.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [int(r["correct"]) for r in rows] == [f["correct"] for f in document["frames"]]
@@ -59,7 +60,8 @@ def test_a_run_writes_figures_plot_and_pictures(tmp_path, console):
     ]
     console.file.flush()
     text = screen(tmp_path)
-    assert "Pooled, overlap 0.8" in text
+    assert "Regions, truth of regions, overlap 0.8" in text
+    assert "labelled:" not in text, "the legend explains what the tables show"
     assert f"{report.pooled[0].correct():.3f}" in text
 
 
@@ -82,18 +84,46 @@ def test_recorded_frames_of_each_kind_of_truth(tmp_path, console):
     report = run_evaluate(
         str(data), config=SegmenterConfig(), console=console, output=output, level="surfaces"
     )
-    assert dict(zip((f.name for f in report.frames), report.groups, strict=True)) == {
-        "alone": "without truth",
-        "objects": "objects",
-        "planes": "regions",
-    }
+    assert report.groups == {"alone": "alone", "objects": "objects", "planes": "planes"}
     alone, objects, planes = report.frames
     assert alone.labels is None and alone.parts is None
     assert 0.5 < objects.parts.purity <= 1
     assert planes.labels.truth_regions > 3
     assert len(list((output / "pictures").iterdir())) == 3
     only = run_evaluate(str(data), config=SegmenterConfig(), console=console, match="pla*", pictures=False)
-    assert [f.name for f in only.frames] == ["planes"]
+    assert [(f.name, f.level) for f in only.frames] == [("planes", "surfaces"), ("planes", "regions")]
+    page = (output / "index.html").read_text("utf-8")
+    for name in ("alone", "objects", "planes"):
+        assert f'<h2 id="{name}">' in page and f'src="pictures/{name}.png"' in page
+    assert "Surfaces, truth of objects" in page and "<script" not in page
+    overview = cv2.imread(str(output / "overview.png"))
+    assert overview.shape[1] == 3 * 320
+    sheets = {n: cv2.imread(str(output / "pictures" / f"{n}.png")) for n in ("alone", "objects")}
+    assert sheets["alone"].shape[1] == 4 * 480 and sheets["objects"].shape[1] == 5 * 480
+
+
+def test_both_levels_have_their_own_rows_and_pools(tmp_path, console):
+    output = tmp_path / "out"
+    report = run_evaluate(
+        "synthetic", config=SegmenterConfig(), console=console, output=output, synthetic=SMALL, level="both"
+    )
+    document = json.loads((output / "metrics.json").read_text())
+    assert [(row["name"], row["labels"]) for row in document["pooled"]] == [
+        ("room", "surfaces"),
+        ("painting", "surfaces"),
+        ("room", "regions"),
+        ("painting", "regions"),
+    ]
+    truth = {(row["labels"], row["name"]): row["truth_regions"] for row in document["pooled"]}
+    assert truth["surfaces", "painting"] < truth["regions", "painting"]
+    assert set(document["correct_over_tolerance"]) == {"surfaces", "regions"}
+    assert report.frames[0].blobs is not None and report.frames[1].blobs is None
+
+
+def test_levels_that_labels_asks_for():
+    assert parse_level("auto", synthetic=True) == ("regions",)
+    assert parse_level("auto", synthetic=False) == parse_level("both", synthetic=True)
+    assert parse_level("surfaces", synthetic=True) == ("surfaces",)
 
 
 def test_an_interrupted_run_keeps_what_was_finished(tmp_path, console, monkeypatch):
