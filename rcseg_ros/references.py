@@ -39,15 +39,15 @@ RELATIVE = ("parts_per_object", "regions")
 """Figures whose tolerance is a share of the expected value."""
 TOLERANCES = {
     "frame": {
-        "purity": 0.006, "boundary_recall": 0.05, "coverage": 0.01, "best_iou": 0.08, "labelled": 0.01,
-        "correct": 2, "parts_per_object": 0.3, "noise": 2, "blobs": 1, "regions": 0.35,
+        "purity": 0.01, "boundary_recall": 0.08, "coverage": 0.01, "best_iou": 0.2, "labelled": 0.01,
+        "correct": 2, "parts_per_object": 0.6, "noise": 2, "blobs": 2, "regions": 0.5,
     },
     "group": {
-        "purity": 0.002, "boundary_recall": 0.02, "coverage": 0.005, "best_iou": 0.03, "labelled": 0.005,
-        "correct": 2, "parts_per_object": 0.1, "noise": 3, "blobs": 0.5, "regions": 0.25,
+        "purity": 0.002, "boundary_recall": 0.02, "coverage": 0.005, "best_iou": 0.04, "labelled": 0.005,
+        "correct": 2, "parts_per_object": 0.15, "noise": 3, "blobs": 1, "regions": 0.25,
     },
 }  # fmt: skip
-"""What a new file begins with; by frame wider than pooled."""
+"""What a new file begins with; by frame wider than pooled, as one piece more of two objects is much."""
 HEADER = """\
 # What `rcseg evaluate` finds on the recorded frames, and how far a later version may stay behind it.
 # The figures are rewritten, tolerances and faces kept, by
