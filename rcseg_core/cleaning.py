@@ -78,4 +78,4 @@ def local_median(channels: NDArray[np.float32], valid: NDArray[np.bool_], out: N
 
 def color_median(color: NDArray[np.uint8], out: NDArray[np.uint8]) -> None:
     """5x5 median of each colour channel into `out`."""
-    cv2.medianBlur(np.ascontiguousarray(color), 5, dst=out)
+    out[...] = cv2.medianBlur(np.ascontiguousarray(color), 5)

@@ -92,4 +92,4 @@ def together(*tasks: Callable[[], object]) -> None:
 
 def over_bands(height: int, work: Callable[[int, int, int], object]) -> None:
     """Call work(band, first row, row after the last) for each band."""
-    together(*(lambda i=i, a=a, b=b: work(i, a, b) for i, (a, b) in enumerate(bands(height))))  # type: ignore[misc]
+    together(*(lambda i=i, a=a, b=b: work(i, a, b) for i, (a, b) in enumerate(bands(height))))

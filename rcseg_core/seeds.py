@@ -342,8 +342,8 @@ def initial_partition(
         sizes = np.concatenate([np.array(wide, np.int64), sizes])
     cuts = _chi2_cuts(signals.image.shape[2])
     # windows keep to bands of rows, which are filled side by side; the literal form knows none
-    bands = max(1, min(BANDS, labels.shape[0] // BAND_PX)) if config.fit == "auto" else 1
-    height = labels.shape[0]
+    height = len(labels)
+    bands = max(1, min(BANDS, height // BAND_PX)) if config.fit == "auto" else 1
     rows = [height * i // bands for i in range(bands + 1)]
     counts = [0] * bands
 

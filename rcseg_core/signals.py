@@ -145,7 +145,7 @@ def build_signals(frame: RangeColorFrame, color: NDArray[np.uint8], config: Segm
     valid = frame.valid
     inverse = uses_inverse_depth(frame, config)
     raw = _range_signal(frame, inverse)
-    median_r, median_c = np.empty_like(raw), np.empty_like(color)
+    median_r, median_c = np.empty_like(raw), np.empty(color.shape, np.uint8)
     together(lambda: local_median(raw, valid, median_r), lambda: color_median(color, median_c))
     noise = estimate_noise(raw, median_r, valid, color, median_c, inverse, config.noise)
 
@@ -157,7 +157,7 @@ def build_signals(frame: RangeColorFrame, color: NDArray[np.uint8], config: Segm
     eps_c = config.grouping.color_tolerance / noise.color
 
     image = np.empty((*valid.shape, n_range + 3), np.float32)
-    cleaned, cleaned_color = np.empty_like(raw), np.empty_like(color)
+    cleaned, cleaned_color = np.empty_like(raw), np.empty(color.shape, np.uint8)
     flags = np.empty(valid.shape, np.uint8)
 
     levels = ((np.arange(256.0) - offset[n_range:, None]) / scale[n_range:, None]).astype(np.float32)

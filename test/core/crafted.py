@@ -18,7 +18,8 @@ def crafted_signals(
     )
     return Signals(
         image=image,
-        cleaned=image.copy(),
+        cleaned=image[..., :n_range].copy(),
+        cleaned_color=np.zeros((*image.shape[:2], 3), np.uint8),
         flags=flags,
         n_range=n_range,
         scale=np.ones(channels),

@@ -37,8 +37,7 @@ def test_pairs_are_those_of_loops_over_pixels(seed, max_gap):
 @given(st.integers(0, 10**6), st.integers(0, 4))
 def test_spreading_is_breadth_first(seed, rounds):
     labels, edges = random_image(seed)
-    cells, met = np.empty_like(labels), np.empty_like(edges)
-    spread(labels, edges, rounds, cells, met)
+    cells, met = spread(labels, edges, rounds)
     wanted_cells, wanted_met = naive_graph.spread(labels, edges, rounds)
     assert np.array_equal(cells, wanted_cells)
     assert np.array_equal(met, wanted_met)

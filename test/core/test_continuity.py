@@ -23,7 +23,9 @@ def joined(value, curved=CURVED, degree=2, edges=None, split=44, sliver_px=0.0, 
     models = fit_models(moments, np.full((3, 2), degree), 1)
     edges = np.zeros(SHAPE, np.uint8) if edges is None else edges
     pairs = find_pairs(labels, 2, edges, 3)
-    return continuous_pairs(labels, signals, models, pairs, curved, sliver_px).merges.tolist()
+    return continuous_pairs(
+        labels, signals, models, pairs, curved, np.bincount(labels.ravel(), minlength=3), sliver_px
+    ).merges.tolist()
 
 
 def test_tangent_is_the_polynomial_and_its_derivatives():

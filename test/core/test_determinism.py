@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rcseg_core import SegmenterConfig, segment
+from rcseg_core import SegmenterConfig, parallel, segment
 from rcseg_core.synthetic import make_scene
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -65,6 +65,23 @@ def test_processes_agree_whatever_their_hash_seed_and_threads(literal):
     for seed, threads in (("1", "1"), ("4242", "4")):
         there = in_a_process(
             "room", 107, 160, 120, literal, threads,
-            PYTHONHASHSEED=seed, NUMBA_NUM_THREADS=threads, OMP_NUM_THREADS=threads,
+            PYTHONHASHSEED=seed, RCSEG_THREADS=threads, OMP_NUM_THREADS=threads,
         )  # fmt: skip
         assert there == here
+
+
+@pytest.mark.parametrize("family", ["room", "curved"])
+def test_the_number_of_threads_changes_nothing(family):
+    """At a size with several bands of rows for every pass."""
+    frame = make_scene(family, 106, width=480, height=360, outliers=0.03).frame
+    found = []
+    try:
+        for number in (1, 2, 3, 7):
+            parallel.set_threads(number)
+            found.append(segment(frame))
+    finally:
+        parallel.set_threads(0)
+    for other in found[1:]:
+        assert digest(other) == digest(found[0])
+        for a, b in zip(found[0].regions, other.regions, strict=True):
+            assert np.array_equal(a.range_patch.control_points, b.range_patch.control_points)

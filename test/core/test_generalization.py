@@ -6,7 +6,7 @@ from oracle import naive_patch
 from scipy.stats import f as f_distribution
 
 from rcseg_core.config import GeneralizationConfig
-from rcseg_core.generalization import choose_degrees, f_test, residual_table
+from rcseg_core.generalization import choose_degrees, f_test, residuals_by_degree
 from rcseg_core.moments import UNIT_PX, accumulate, tensor_exponents
 
 SHAPE = (40, 48)
@@ -37,8 +37,7 @@ def chosen(moments, **changes):
 
 def test_the_table_holds_residual_sums_of_pixels():
     image, moments = measured(surface(lambda x, y: 5 * x * x - 3 * x * y * y))
-    table = np.zeros((2, 2, 4))
-    residual_table(moments, 1, tuple(tensor_exponents(k) for k in range(5)), table)
+    table = residuals_by_degree(moments, 1, 4)
     rows, cols = np.mgrid[: SHAPE[0], : SHAPE[1]]
     x, y = (cols.ravel() - 23.5) / UNIT_PX, (rows.ravel() - 19.5) / UNIT_PX
     values = image.reshape(-1, 3).astype(float)
@@ -61,12 +60,11 @@ def test_f_test_is_equations_22_and_23():
 
 def test_f_test_of_pure_noise_is_wrong_as_often_as_it_says():
     """Under the null hypothesis P is uniform on [0, 1]: 400 noise regions, one channel and three."""
-    table = np.zeros((401, 2, 4))
     rng = np.random.default_rng(5)
     image = rng.normal(size=(20 * 8, 20 * 50, 4)).astype(np.float32)
     labels = (np.arange(8)[:, None] * 50 + np.arange(50) + 1).repeat(20, 0).repeat(20, 1).astype(np.int32)
     moments = accumulate(image, np.zeros(labels.shape, np.uint8), labels, 400, 2)
-    residual_table(moments, 1, tuple(tensor_exponents(k) for k in range(3)), table)
+    table = residuals_by_degree(moments, 1, 2)
     for modality, channels in ((0, 1), (1, 3)):
         low, high = table[1:, modality, 0], table[1:, modality, 1]
         p = f_test(low, high, moments.count[1:], 4, 9, channels)

@@ -36,9 +36,10 @@ def estimated(w, valid=None, color=None, **changes):
     valid = np.ones(w.shape[:2], bool) if valid is None else valid
     w[~valid] = 0
     color = np.full((*w.shape[:2], 3), 128, np.uint8) if color is None else color
-    return estimate_noise(
-        w, local_median(w, valid), valid, color, color_median(color), True, NoiseConfig(**changes)
-    )
+    median, median_c = np.empty_like(w), np.empty_like(color)
+    local_median(w, valid, median)
+    color_median(color, median_c)
+    return estimate_noise(w, median, valid, color, median_c, True, NoiseConfig(**changes))
 
 
 def white(seed=0):
@@ -52,7 +53,8 @@ def test_window_residuals_are_those_of_a_plane_through_the_pixels():
     valid = rng.random(rows.shape) > 0.2
     median = np.where(valid, values, 0).astype(np.float32)  # no impulse
     out = np.empty((6, 3))
-    window_residuals(values, median, valid, 1.0, 20, out)
+    window_residuals(values[..., None], median[..., None], valid, 0, 1.0, 20, 0, 1, out)
+    window_residuals(values[..., None], median[..., None], valid, 0, 1.0, 20, 1, 2, out)
     index = 0
     for row0 in (0, 20):
         for col0 in (0, 20, 40):

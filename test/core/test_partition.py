@@ -13,6 +13,7 @@ from rcseg_core.grouping import Grouped
 from rcseg_core.models import fit_models
 from rcseg_core.moments import accumulate, region_boxes
 from rcseg_core.partition import Partition
+from rcseg_core.signals import INVALID
 
 SHAPE = (18, 24)
 
@@ -62,7 +63,7 @@ def test_labels_leaves_and_tree_stay_in_step(seed):
     partition.apply(grouped((1, 2), (1, 5), (7, 3)))
     assert partition.count == 5
     check(partition)
-    partition.add_leftovers(np.ones(SHAPE, bool), 3)
+    partition.add_leftovers(np.zeros(SHAPE, np.uint8), 3)
     check(partition)
     partition.apply(grouped((2, 1), height=0.1))
     check(partition)
@@ -128,13 +129,14 @@ def test_leftovers_are_connected_large_enough_and_keep_within():
     wanted = np.zeros(SHAPE, bool)
     wanted[2:6, 6:12] = True  # 24 px
     wanted[10, 6:9] = True  # 3 px
+    flags = np.where(wanted, 0, INVALID).astype(np.uint8)
     partition = Partition(labels, 1)
-    assert partition.add_leftovers(wanted, 4) == 1
+    assert partition.add_leftovers(flags, 4) == 1
     assert np.array_equal(partition.labels == 2, (np.arange(SHAPE[0])[:, None] < 6) & wanted)
     check(partition)
     within = np.where(np.arange(SHAPE[1]) < 9, 1, 2)[None].repeat(SHAPE[0], 0).astype(np.int32)
     partition = Partition(start, 1, within)
-    assert partition.add_leftovers(wanted, 1) == 3
+    assert partition.add_leftovers(flags, 1) == 3
     for k in range(2, 5):
         part = partition.labels == k
         assert cv2.connectedComponents(part.astype(np.uint8), connectivity=4)[0] == 2

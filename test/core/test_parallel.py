@@ -1,0 +1,80 @@
+"""Bands and tasks: all of them, once, on any number of threads; errors come out; nesting never locks up."""
+
+import threading
+
+import pytest
+
+from rcseg_core import parallel
+
+
+@pytest.fixture(params=[1, 2, 4])
+def number(request):
+    parallel.set_threads(request.param)
+    yield request.param
+    parallel.set_threads(0)
+
+
+def test_bands_cover_all_rows_once():
+    for height in (3, 4, 5, 480, 481):
+        rows = [row for first, last in parallel.bands(height) for row in range(first, last)]
+        assert rows == list(range(height))
+
+
+def test_every_task_runs_once(number):
+    done = []
+    parallel.together(*(lambda i=i: done.append(i) for i in range(50)))
+    assert sorted(done) == list(range(50))
+    bands = []
+    parallel.over_bands(100, lambda *band: bands.append(band))
+    assert sorted(bands) == [(0, 0, 25), (1, 25, 50), (2, 50, 75), (3, 75, 100)]
+
+
+def test_tasks_run_at_once_where_there_are_threads():
+    parallel.set_threads(2)
+    try:
+        meet = threading.Barrier(2, timeout=10)  # breaks unless both are there
+        parallel.together(meet.wait, meet.wait)
+    finally:
+        parallel.set_threads(0)
+
+
+def test_an_error_of_a_task_is_raised(number):
+    def fail():
+        raise KeyError("here")
+
+    with pytest.raises(KeyError, match="here"):
+        parallel.together(*[fail, lambda: None] * 3)
+    done = []
+    parallel.together(lambda: done.append(1))
+    assert done == [1]
+
+
+def test_nested_passes_of_many_callers_end(number):
+    """More callers than workers, each waiting for tasks of its own."""
+    done = []
+
+    def caller():
+        parallel.together(*(lambda: parallel.over_bands(8, lambda *_: done.append(1)) for _ in range(6)))
+
+    threads = [threading.Thread(target=caller, daemon=True) for _ in range(12)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(30)
+        assert not thread.is_alive()
+    assert len(done) == 12 * 6 * 4
+
+
+def test_threads_come_from_the_environment(monkeypatch):
+    for text, wanted in (
+        ("3", 3),
+        ("", parallel.cores()),
+        ("none", parallel.cores()),
+        ("0", parallel.cores()),
+    ):
+        monkeypatch.setenv("RCSEG_THREADS", text)
+        parallel.set_threads(0)
+        assert parallel.threads() == wanted
+    parallel.set_threads(0)
+    with pytest.raises(ValueError, match="threads"):
+        parallel.set_threads(-1)
