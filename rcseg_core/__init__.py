@@ -6,7 +6,8 @@ from rcseg_core.errors import ConfigError, InputError, RcsegError
 from rcseg_core.frame import PinholeCamera, RangeColorFrame
 from rcseg_core.hierarchy import Hierarchy
 from rcseg_core.pipeline import segment
-from rcseg_core.segmentation import Region, Segmentation
+from rcseg_core.primitives import Primitive
+from rcseg_core.segmentation import Region, Segmentation, Surface
 
 __all__ = [
     "BezierPatch",
@@ -14,10 +15,12 @@ __all__ = [
     "Hierarchy",
     "InputError",
     "PinholeCamera",
+    "Primitive",
     "RangeColorFrame",
     "RcsegError",
     "Region",
     "Segmentation",
     "SegmenterConfig",
+    "Surface",
     "segment",
 ]

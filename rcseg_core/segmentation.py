@@ -10,11 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rcseg_core.bezier import BezierPatch
+from rcseg_core.cells import gather_cells
 from rcseg_core.frame import PinholeCamera
 from rcseg_core.grouping import Grouped
 from rcseg_core.hierarchy import Hierarchy, TreeBuilder
 from rcseg_core.models import Models
+from rcseg_core.moments import region_boxes
 from rcseg_core.noise import NoiseModel
+from rcseg_core.primitives import Primitive, recognise
 from rcseg_core.rendering import render
 from rcseg_core.signals import Signals
 
@@ -44,6 +47,29 @@ class Region:
     neighbors: tuple[int, ...]
     range_patch: BezierPatch
     color_patch: BezierPatch
+
+
+@dataclass(frozen=True)
+class Surface:
+    """One continuous surface: a union of regions, and the shape that it has.
+
+    Attributes
+    ----------
+    label : value in `Segmentation.surface_labels`
+    pixel_count : assigned pixels
+    box : (row_min, col_min, row_max, col_max), inclusive
+    regions : labels of the regions that lie on it, ascending
+    primitive : Primitive; its kind is "none" where no plane, sphere or cylinder is the surface, or where the
+        pixels do not tell
+    candidates : the primitives that were tried, as fitted, simplest first; what speaks against them is theirs
+    """
+
+    label: int
+    pixel_count: int
+    box: tuple[int, int, int, int]
+    regions: tuple[int, ...]
+    primitive: Primitive
+    candidates: tuple[Primitive, ...]
 
 
 @dataclass(frozen=True)
@@ -84,6 +110,20 @@ class Segmentation:
     def regions(self) -> Sequence[Region]:
         """All regions, ``regions[i].label == i + 1``; described on first use."""
         return self.describe()
+
+    @cached_property
+    def surfaces(self) -> Sequence[Surface]:
+        """All surfaces, ``surfaces[i].label == i + 1``, with the primitives they are; found on first use."""
+        cells = gather_cells(self.labels, self.surface_labels, self.signals, self.models, self.camera)
+        sizes = np.bincount(self.surface_labels.ravel(), minlength=len(cells) + 1)
+        regions: list[list[int]] = [[] for _ in range(len(cells) + 1)]
+        for region in self.regions:
+            regions[region.surface].append(region.label)
+        boxes = region_boxes(self.surface_labels, len(cells)).tolist()
+        return [
+            Surface(s, int(sizes[s]), tuple(boxes[s]), tuple(regions[s]), *recognise(part))
+            for s, part in enumerate(cells, start=1)
+        ]
 
     @cached_property
     def hierarchy(self) -> Hierarchy:

@@ -36,7 +36,7 @@ def warm_up(config: SegmenterConfig, announce: Callable[[str], None]) -> float:
     reporter = threading.Thread(target=report, daemon=True)
     reporter.start()
     try:
-        segment(_small_scene(), config)
+        _ = segment(_small_scene(), config).surfaces
     finally:
         done.set()
         reporter.join()

@@ -1,0 +1,197 @@
+"""Primitives on top of patches: is a surface a plane, a sphere, a cylinder, or none of these?
+
+Each is fitted to the cells of a surface by weighted least squares of distances over their noise, which is a
+law of depth. Noise alone would reject every plane of a real sensor at 20 000 pixels, so the test asks whether
+the primitive misses the surface by more than a small share of noise and tolerance: then chi-squared is a
+noncentral one. The simplest primitive that passes is taken; when none does, the answer is "none".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammaincc
+
+from rcseg_core.cells import Cells
+from rcseg_core.shapes import (
+    KINDS,
+    PLANE,
+    Shape,
+    fit_shape,
+    parameters,
+    residuals,
+    start_cylinder,
+    start_plane,
+    start_sphere,
+    transfer,
+)
+
+Array = NDArray[np.float64]
+
+#: Share of sigma, and of the tolerance, that a plane and a curved shape may miss a surface by (rms). Sensors
+#: bend planes: floor, lid and box of a Kinect recording are 0.0016 to 0.0022 of their depth off.
+ALLOWED_FLAT, ALLOWED_CURVED = 0.75, 0.25
+#: P of the test below which a primitive is rejected.
+LEAST_P = 0.01
+#: Normals must turn by this angle over the surface, or its curvature is not seen; rad.
+LEAST_ARC = 0.35
+#: Largest standard error of a direction, rad, and of a radius, relative, that still counts as known.
+KNOWN = 0.1
+#: Curved shapes are fitted where the surface is seen at this cosine at least: nearer to the limb, neither the
+#: mean of a cell nor the noise along its ray tells where the surface is.
+LEAST_COSINE = 0.5
+#: Unless less than this share of the pixels would be left.
+LEAST_SEEN = 0.3
+#: Residuals beyond this many deviations count for no more: a crumb on a table makes it no less a plane.
+CLIP = 4.0
+#: Cells, and independent measurements, that a fit needs.
+LEAST_CELLS = 8
+
+
+@dataclass(frozen=True)
+class Primitive:
+    """A shape with its uncertainty, in the camera's (scanner's) frame.
+
+    Attributes
+    ----------
+    kind : "plane", "sphere", "cylinder" or "none"
+    parameters : float64 arrays by name, in the order of `covariance`
+        plane: ``normal`` (3,), towards the sensor, and ``distance`` (), m, with normal . x = distance;
+        sphere: ``center`` (3,), m, and ``radius`` (), m;
+        cylinder: ``point`` (3,) of the axis, m, beside the surface's middle, ``axis`` (3,), ``radius`` (), m
+    covariance : (q, q) float64 of the parameters in this order; unit vectors vary across themselves only, and
+        the point of a cylinder across its axis; widened where the misfit is more than noise
+    convex : whether the sensor sees the outside; True for a plane
+    rms_m : rms distance of the single pixels, m
+    rms_sigma : the same along the ray, over the sensor's noise there; 1: nothing but noise
+    misfit_m : rms distance between the shape and the surface, noise taken off, m
+    p_value : probability of so much misfit or more if the shape is right within what is allowed
+    arc : angle that the normals turn by over nine tenths of the surface, rad
+    """
+
+    kind: str
+    parameters: Mapping[str, Array]
+    covariance: Array
+    convex: bool
+    rms_m: float
+    rms_sigma: float
+    misfit_m: float
+    p_value: float
+    arc: float
+
+    @property
+    def standard_errors(self) -> dict[str, Array]:
+        """Roots of the diagonal of `covariance`, by the names of the parameters."""
+        roots, at, out = np.sqrt(np.maximum(np.diag(self.covariance), 0.0)), 0, {}
+        for name, value in self.parameters.items():
+            out[name] = roots[at : at + value.size].reshape(value.shape)
+            at += value.size
+        return out
+
+
+NONE = Primitive("none", {}, np.empty((0, 0)), True, np.nan, np.nan, np.nan, np.nan, np.nan)
+
+
+def allowed(cells: Cells, kind: int) -> Array:
+    """(m,) squared misfit that a shape of this kind may have, over the variance of each cell."""
+    share = ALLOWED_FLAT if kind == PLANE else ALLOWED_CURVED
+    return np.asarray(cells.worth * share**2 * (1.0 + cells.tolerance2))
+
+
+def fit(start: Shape | None, cells: Cells) -> Primitive | None:
+    """The least-squares shape next to a first guess; None without one, or where the cells do not tell it."""
+    if start is None:
+        return None
+    limit = CLIP * np.sqrt(1.0 + allowed(cells, start.kind))
+    found = fit_shape(start, cells.points, cells.spread, limit)
+    return None if found is None else assess(*found, cells)
+
+
+def noncentral_p(chi2: float, freedom: float, excess: float) -> float:
+    """P that a noncentral chi-squared variable exceeds chi2 (Patnaik's scaled chi-squared)."""
+    scale = (freedom + 2.0 * excess) / (freedom + excess)
+    return float(gammaincc(0.5 * (freedom + excess) / scale, 0.5 * chi2 / scale))
+
+
+def turn(normals: Array) -> float:
+    """Opening angle of the cone about their mean that holds nine tenths of unit normals (m, 3), rad."""
+    mean = normals.mean(axis=0)
+    length = float(np.sqrt(mean @ mean))
+    if length < 1e-9:
+        return float(np.pi)
+    cosines = np.sort(normals @ (mean / length))
+    return 2.0 * float(np.arccos(np.clip(cosines[len(cosines) // 10], -1.0, 1.0)))
+
+
+def assess(shape: Shape, covariance: Array, cells: Cells) -> Primitive:
+    """A fitted shape as a Primitive.
+
+    covariance : (q, q) of its local parameters
+    cells : those it was fitted to
+    """
+    miss = residuals(shape, cells.points, cells.spread)
+    excess = allowed(cells, shape.kind)
+    freedom = max(len(miss.whitened) - len(covariance), 1)
+    chi2 = float(np.sum(np.minimum(miss.whitened**2, CLIP**2 * (1.0 + excess))))
+    share = cells.pixels / cells.pixels.sum()
+    # a pixel misses the mean of its cell by noise; the mean misses the shape by less noise, and by misfit
+    cell_variance = miss.sigma**2
+    pixel_variance = cells.worth * cell_variance / max(cells.scatter, 1.0)
+    beyond = cells.scatter * (1.0 - 1.0 / cells.pixels)
+    missed = miss.whitened**2 * cell_variance
+    misfit2 = float(share @ (missed - cell_variance * freedom / len(missed)))
+    to_all = transfer(shape)
+    return Primitive(
+        kind=KINDS[shape.kind],
+        parameters=parameters(shape),
+        covariance=to_all @ (covariance * max(1.0, chi2 / freedom)) @ to_all.T,
+        convex=shape.kind == PLANE or float(share @ np.sum(miss.gradients * cells.points, axis=1)) < 0,
+        rms_m=float(np.sqrt(share @ (beyond * pixel_variance + missed))),
+        rms_sigma=float(np.sqrt(share @ (beyond + missed / pixel_variance))),
+        misfit_m=float(np.sqrt(max(misfit2, 0.0))),
+        p_value=noncentral_p(chi2, freedom, float(excess.sum())),
+        arc=turn(miss.gradients),
+    )
+
+
+def recognise(cells: Cells) -> tuple[Primitive, tuple[Primitive, ...]]:
+    """The primitive that a surface is, and all that were tried.
+
+    Returns
+    -------
+    primitive : the simplest that passes the test and is known well enough, or `NONE`
+    candidates : the plane, and where it fails the sphere and the cylinder, as fitted
+    """
+    if len(cells.points) < LEAST_CELLS or cells.worth.sum() < LEAST_CELLS:
+        return NONE, ()
+    plane = fit(start_plane(cells.points, cells.pixels / cells.pixels.sum()), cells)
+    if plane is not None and plane.p_value >= LEAST_P:
+        return (plane if is_known(plane) else NONE), (plane,)
+    seen = without_limb(cells)
+    weight = seen.pixels / seen.pixels.sum()
+    starts = start_sphere(seen.points, weight), start_cylinder(seen.points, seen.normals, weight)
+    curved = [c for c in (fit(start, seen) for start in starts) if c is not None]
+    adequate = [c for c in curved if c.p_value >= LEAST_P and c.arc >= LEAST_ARC and is_known(c)]
+    best = min(adequate, key=lambda c: c.misfit_m, default=NONE)
+    return best, tuple(c for c in (plane, *curved) if c is not None)
+
+
+def without_limb(cells: Cells) -> Cells:
+    """The cells that are not seen at a grazing angle."""
+    slant = np.abs(np.sum(cells.points * cells.normals, axis=1))
+    seen = slant >= LEAST_COSINE * np.sqrt(np.sum(cells.points**2, axis=1))
+    if cells.pixels[seen].sum() < LEAST_SEEN * cells.pixels.sum() or seen.sum() < LEAST_CELLS:
+        return cells
+    return cells.chosen(seen)
+
+
+def is_known(primitive: Primitive) -> bool:
+    """Whether the errors of the direction and of the radius are small enough to be of use."""
+    errors = primitive.standard_errors
+    known = [float(np.linalg.norm(errors[name])) for name in ("normal", "axis") if name in errors]
+    if "radius" in errors:
+        known.append(float(errors["radius"]) / max(float(primitive.parameters["radius"]), 1e-12))
+    return all(error <= KNOWN for error in known)
