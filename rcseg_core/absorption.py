@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rcseg_core.components import count_unassigned
 from rcseg_core.jit import bare
 from rcseg_core.models import Models, pixel_cost
 from rcseg_core.signals import COLOR_OUTLIER, INVALID, RANGE_OUTLIER, Signals
@@ -63,20 +64,6 @@ def _bucket(models, k, image, flags, row, col, n_range, law, color_eps2, max_cos
     if flags[row, col] & (RANGE_OUTLIER | COLOR_OUTLIER) != 0:
         cost += IMPULSE_SHARE * max_cost
     return np.int64(cost * (BUCKETS / max_cost)) if cost < max_cost else np.int64(-1)
-
-
-@bare
-def _count(labels, flags, total):  # type: ignore[no-untyped-def]
-    for row in range(labels.shape[0]):
-        for col in range(labels.shape[1]):
-            total[0] += (labels[row, col] == 0) & (flags[row, col] & INVALID == 0)
-
-
-def count_unassigned(labels: NDArray[np.int32], flags: NDArray[np.uint8]) -> int:
-    """Measured pixels without a region."""
-    total = np.zeros(1, np.int64)
-    _count(labels, flags, total)
-    return int(total[0])
 
 
 @bare

@@ -111,20 +111,19 @@ def choose_degrees(
     table = residuals_by_degree(moments, n_range, max(reached, 1))
     degree: NDArray[np.int64] = start.copy()
     n = moments.count
-    index = np.arange(n.size)
     tops = (min(config.max_range_degree, highest), min(config.max_color_degree, highest))
     widths = (n_range, channels - n_range)
     for modality, (width, top) in enumerate(zip(widths, tops, strict=True)):
         for high in range(2, min(top, reached) + 1):
             for low in range(1, high):
-                rss_low, rss_high = table[:, modality, low - 1], table[:, modality, high - 1]
-                independent = n / correlation[modality]
                 p_low, p_high = (low + 1) ** 2, (high + 1) ** 2
-                grow = f_test(rss_low, rss_high, independent, p_low, p_high, width) < config.alpha
+                asked = (degree[:, modality] == low) & (n >= PIXELS_PER_COEFFICIENT * p_high)
+                rss_low, rss_high = table[:, modality, low - 1], table[:, modality, high - 1]
                 if config.test == "guarded":
                     effect = (rss_low - rss_high) / np.maximum(n, 1)
-                    grow &= effect > config.min_effect**2 * width * variance[:, modality]
-                grow &= n >= PIXELS_PER_COEFFICIENT * p_high
-                grow &= degree[index, modality] == low
-                degree[grow, modality] = high
+                    asked &= effect > config.min_effect**2 * width * variance[:, modality]
+                k = np.nonzero(asked)[0]
+                independent = n[k] / correlation[modality]
+                p_value = f_test(rss_low[k], rss_high[k], independent, p_low, p_high, width)
+                degree[k[p_value < config.alpha], modality] = high
     return degree

@@ -10,14 +10,15 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from rcseg_core.absorption import absorb, count_unassigned, refine
+from rcseg_core.absorption import absorb, refine
 from rcseg_core.adjacency import Pairs, find_pairs
+from rcseg_core.components import label_parts
 from rcseg_core.grouping import Grouped
 from rcseg_core.hierarchy import TreeBuilder
 from rcseg_core.jit import bare
 from rcseg_core.models import Models
 from rcseg_core.moments import Moments, accumulate, region_boxes
-from rcseg_core.signals import INVALID, Signals
+from rcseg_core.signals import Signals
 
 
 @bare
@@ -65,56 +66,6 @@ def _first_groups(labels, within, group):  # type: ignore[no-untyped-def]
             if k != before:
                 group[k] = within[row, col]
                 before = k
-
-
-@bare
-def _flood(labels, leaves, flags, within, least, first_label, first_leaf, queue):  # type: ignore[no-untyped-def]
-    """Number the 4-connected parts of unassigned pixels that have at least `least`; returns how many.
-
-    Only measured pixels take part, and a part keeps to one value of `within` ((1, 1): no bounds).
-    queue : (unassigned pixels,) int64 scratch.
-    """
-    height, width = labels.shape
-    bounded = within.shape[0] == height
-    found = 0
-    end = 0
-    for row in range(height):
-        for col in range(width):
-            if labels[row, col] != 0 or flags[row, col] & INVALID != 0:
-                continue
-            start = end
-            queue[end] = row * width + col
-            end += 1
-            labels[row, col] = -1
-            at = start
-            while at < end:
-                y = queue[at] // width
-                x = queue[at] - y * width
-                at += 1
-                for d in range(4):
-                    r = y + (d == 1) - (d == 0)
-                    c = x + (d == 3) - (d == 2)
-                    if r < 0 or c < 0 or r >= height or c >= width:
-                        continue
-                    if labels[r, c] != 0 or flags[r, c] & INVALID != 0:
-                        continue
-                    if bounded and within[r, c] != within[y, x]:
-                        continue
-                    labels[r, c] = -1
-                    queue[end] = r * width + c
-                    end += 1
-            if end - start >= least:
-                for i in range(start, end):
-                    y = queue[i] // width
-                    x = queue[i] - y * width
-                    labels[y, x] = first_label + found
-                    leaves[y, x] = first_leaf + found
-                found += 1
-    for i in range(end):
-        y = queue[i] // width
-        x = queue[i] - y * width
-        labels[y, x] = max(labels[y, x], 0)
-    return found
 
 
 @bare
@@ -209,15 +160,10 @@ class Partition:
 
     def add_leftovers(self, flags: NDArray[np.uint8], least: int) -> int:
         """Unassigned pixels become regions where at least `least` hang together; returns how many."""
-        room = count_unassigned(self.labels, flags)
-        if room == 0:
-            return 0
         old_leaves = self.tree.leaf_count
-        within = np.zeros((1, 1), np.int32) if self.within is None else self.within
-        extra: int = _flood(
-            self.labels, self.leaves, flags, within, least, self.count + 1, old_leaves + 1,
-            np.empty(room, np.int64),
-        )  # fmt: skip
+        extra = label_parts(
+            self.labels, self.leaves, flags, self.within, least, self.count + 1, old_leaves + 1
+        )
         if extra == 0:
             return 0
         self.tree.add_leaves(extra)

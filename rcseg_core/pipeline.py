@@ -30,6 +30,8 @@ from rcseg_core.stages import (
 )
 from rcseg_core.surfaces import bridge_holes, majority, number_surfaces, surfaces_of
 
+#: Made once: every parameter is checked when a configuration is made.
+DEFAULT = SegmenterConfig()
 #: Rounds of regrouping after the points are settled; two are seldom needed.
 MAX_ROUNDS = 3
 
@@ -57,7 +59,7 @@ def segment(
     ------
     ConfigError, InputError
     """
-    config = config or SegmenterConfig()
+    config = config or DEFAULT
     if not isinstance(config, SegmenterConfig):
         raise ConfigError(f"config: expected a SegmenterConfig, got {type(config).__name__}")
     clock = Clock()
