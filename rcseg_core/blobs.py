@@ -28,6 +28,8 @@ PREDICTED_SHARE = 0.5
 SIGMAS = 3.0
 RELATIVE_TOLERANCE = 0.005
 """Half a percent of the distance, 5 mm at 1 m: what deviates less is no thing of its own on a wall."""
+SMOOTH_STEPS, SMOOTH_RELATIVE = 4.0, 0.01
+"""A band whose 3 deviations exceed 4 steps between its neighbours and 1 % holds more than noise: no model."""
 EIGHT = np.ones((3, 3), bool)
 
 
@@ -59,7 +61,8 @@ def find_blobs(
       surface's pixels in a band round the part, explains at least half of the part's pixels within a
       tolerance: the largest of 3 standard deviations of the band's own pixels (1.4826 x median absolute
       residual), one step of a quantised sensor (the median of the steps between the band's neighbours that
-      differ) and 0.5 % of the distance.
+      differ) and 0.5 % of the distance. Where 3 deviations exceed both 4 such steps and 1 % of the distance
+      the band is no smooth surface, and explains nothing.
 
     So a thing that stands out from a wall by more than the wall's noise is none, and neither is a region
     between two surfaces.
@@ -140,19 +143,22 @@ def _predicts(band: NDArray[np.bool_], inside: NDArray[np.bool_], signal: NDArra
     if not len(values):
         return False
     kept = np.ones(len(values), bool)
-    least = max(RELATIVE_TOLERANCE * float(np.median(np.abs(values))), _quantum(signal, band))
+    size, step = float(np.median(np.abs(values))), _median_step(signal, band)
     for _ in range(3):  # strangers in the band (edges, other things of the same surface) are left out
         if kept.sum() < 2 * terms.shape[1]:
             return False
         model = np.linalg.lstsq(terms[kept], values[kept], rcond=None)[0]
         residual = np.abs(values - terms @ model)
-        tolerance = max(SIGMAS * 1.4826 * float(np.median(residual)), least)
+        noise = SIGMAS * 1.4826 * float(np.median(residual))
+        tolerance = max(noise, step, RELATIVE_TOLERANCE * size)
         kept = residual <= tolerance
+    if noise > max(SMOOTH_STEPS * step, SMOOTH_RELATIVE * size):
+        return False
     off = np.abs(signal[inside] - design[inside] @ model)
     return bool(np.mean(off <= tolerance) >= PREDICTED_SHARE)
 
 
-def _quantum(signal: NDArray[np.float64], band: NDArray[np.bool_]) -> float:
+def _median_step(signal: NDArray[np.float64], band: NDArray[np.bool_]) -> float:
     """Median of the steps between horizontal neighbours of `band` that differ; 0 when none do."""
     steps = np.abs(np.diff(signal, axis=1))[band[:, 1:] & band[:, :-1]]
     steps = steps[steps > 0]

@@ -89,6 +89,24 @@ def page_tables(report: Report, tolerance: float) -> str:
     )
 
 
+def markdown_tables(report: Report, tolerance: float, *, pooled_only: bool = False) -> str:
+    """The same tables as Markdown, each under its title in bold; by frame and pooled, or the latter alone."""
+    texts = []
+    for title, frames, pooled in _sections(report, tolerance):
+        rows = pooled if pooled_only else [*frames, *pooled]
+        if not rows:
+            continue
+        columns = _columns(rows)
+        heads = ["" if pooled_only else "frame", *(head for head, _ in columns.values())]
+        lines = [heads, ["---", *("---:" for _ in columns)]]
+        for row in rows:
+            name = row["frame"] if "frame" in row else row["name"] if pooled_only else f"**{row['name']}**"
+            lines.append([str(name), *_cells(row, columns)])
+        table = "\n".join(f"| {' | '.join(line)} |" for line in lines)
+        texts.append(f"**{title}**\n\n{table}")
+    return "\n\n".join(texts)
+
+
 Rows = list[dict[str, Any]]
 
 

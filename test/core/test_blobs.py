@@ -89,3 +89,9 @@ def test_the_larger_of_two_is_never_the_blob():
     labels = np.full((HEIGHT, WIDTH), 2, np.int32)
     labels[10:-10, 10:-10] = 1
     assert [blob.label for blob in find_blobs(labels, wall(), 100)] == [2]
+
+
+def test_a_surface_that_is_not_smooth_explains_nothing():
+    """The host steps by half a metre all round the piece: no quadratic with noise, whatever its spread."""
+    steps = [((slice(None), slice(col, col + 10)), 0.5) for col in range(0, WIDTH, 20)]
+    assert not find_blobs(labels_with(MIDDLE), wall(steps), 100)

@@ -14,6 +14,7 @@ from rcseg_core.errors import InputError
 from rcseg_core.synthetic import FAMILIES, make_scene
 from rcseg_ros.evaluate import run_evaluate
 from rcseg_ros.evaluate_options import SyntheticOptions, parse_families, parse_level, parse_seeds, parse_size
+from rcseg_ros.reports import markdown_tables
 
 SMALL = SyntheticOptions(families=("room", "painting"), seeds=(0, 1), width=160, height=120)
 
@@ -96,6 +97,10 @@ def test_recorded_frames_of_each_kind_of_truth(tmp_path, console):
     for name in ("alone", "objects", "planes"):
         assert f'<h2 id="{name}">' in page and f'src="pictures/{name}.png"' in page
     assert "Surfaces, truth of objects" in page and "<script" not in page
+    text = markdown_tables(report, 0.8)
+    (row,) = [line for line in text.splitlines() if line.startswith("| planes |")]
+    assert f" {planes.labels.at().correct} " in row and "| **planes** | 1 |" in text
+    assert "**planes**" not in markdown_tables(report, 0.8, pooled_only=True)
     overview = cv2.imread(str(output / "overview.png"))
     assert overview.shape[1] == 3 * 320
     sheets = {n: cv2.imread(str(output / "pictures" / f"{n}.png")) for n in ("alone", "objects")}
