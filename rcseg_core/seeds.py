@@ -15,20 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from rcseg_core.components import label_parts
 from rcseg_core.config import SeedsConfig
-from rcseg_core.generalization import residuals_by_degree
 from rcseg_core.jit import bare, kernel
-from rcseg_core.models import fit_models, pixel_cost
-from rcseg_core.moments import accumulate, region_boxes
-from rcseg_core.parallel import BANDS, over_bands, together
-from rcseg_core.signals import INVALID, Signals, local_scales
+from rcseg_core.parallel import BANDS, together
+from rcseg_core.plain import plain_surfaces
+from rcseg_core.signals import Signals, local_scales
 
 #: Windows beyond the largest of the paper, tried first and taken only where plain least squares leaves pure
 #: noise: fewer seeds to group on wide plain surfaces.
 WIDE_WINDOWS_PX = (31, 19)
-#: Share of a surface that one colour model must predict, its least pixels in every ROW_STEP-th row.
-MIN_PLAIN, LEAST_PLAIN, ROW_STEP = 0.8, 100, 4
 #: Least height of a band of rows that is filled on its own.
 BAND_PX = 100
 #: A seed must keep this share of its usable pixels as inliers (LMS breaks down at half).
@@ -312,97 +307,11 @@ def _renumber(labels, first, last, offset):  # type: ignore[no-untyped-def]
 
 @bare
 def _add(labels, more, offset):  # type: ignore[no-untyped-def]
-    """Write the labels of `more` over `labels`, numbered from offset + 1; returns the highest of them."""
-    highest = 0
+    """Write the labels of `more` over `labels`, numbered from offset + 1."""
     for row in range(labels.shape[0]):
         for col in range(labels.shape[1]):
             if more[row, col] > 0:
                 labels[row, col] = more[row, col] + offset
-                highest = max(highest, more[row, col])
-    return highest
-
-
-@bare
-def _mark(image, flags, edges, within, accepted, models, law, eps2_c, limit, first, last, out):  # type: ignore[no-untyped-def]
-    """Rows of out: 0 where the colour of a pixel is that of its accepted surface, else INVALID."""
-    for row in range(first, last):
-        for col in range(within.shape[1]):
-            k = within[row, col]
-            plain = k > 0 and accepted[k] and flags[row, col] == 0 and edges[row, col] == 0
-            if plain:
-                plain = pixel_cost(models, k, image, flags, row, col, 0, law, eps2_c) <= limit
-            out[row, col] = 0 if plain else INVALID
-
-
-def plain_surfaces(
-    signals: Signals, edges: NDArray[np.uint8], within: NDArray[np.int32], cut: float
-) -> NDArray[np.int32]:
-    """The widest windows of all: surfaces most of which have one first-order colour.
-
-    A model is fitted to every fourth row, twice without what it does not predict. Where MIN_PLAIN of the
-    surface remain and their residual is noise, held to what windows are held to, connected pixels that the
-    model predicts are seeds.
-
-    Parameters
-    ----------
-    signals : of colour alone
-    within : (H, W) int32, the surfaces; cut : chi2_{3,0.975}
-
-    Returns
-    -------
-    (H, W) int32, 0 where no plain surface is, seeds 1, 2, ... elsewhere
-    """
-    seeds = np.zeros_like(within)
-    count = int(within.max(initial=0))
-    if count == 0:
-        return seeds
-    rows = slice(ROW_STEP // 2, None, ROW_STEP)
-    image, part = np.ascontiguousarray(signals.image[rows]), np.ascontiguousarray(within[rows])
-    flags, edge = np.ascontiguousarray(signals.flags[rows]), np.ascontiguousarray(edges[rows])
-    usable = flags | (edge > 0)
-    first = np.ones((count + 1, 2), np.int64)
-    boxes = region_boxes(part, count)
-    everywhere = np.ones(count + 1, np.bool_)
-    whole = moments = accumulate(image, usable, part, count, 1, boxes)
-    kept = np.empty_like(flags)
-    for limit in (4.0 * cut, cut):
-        models = fit_models(moments, first, 0, planes=True)
-        _mark(
-            image,
-            flags,
-            edge,
-            part,
-            everywhere,
-            models,
-            signals.law,
-            signals.color_eps2,
-            limit,
-            0,
-            len(part),
-            kept,
-        )
-        moments = accumulate(image, kept, part, count, 1, boxes)
-    n = moments.count
-    slack = NOISE_FACTOR + 4.0 / np.sqrt(np.maximum(n - 3, 1))
-    rss = residuals_by_degree(moments, 0, 1)[:, 1, 0]
-    accepted = rss <= np.maximum(n - 3, 0) * 3 * slack + n * 0.25 * signals.color_eps2
-    accepted &= n >= np.maximum(MIN_PLAIN * whole.count, LEAST_PLAIN)
-    if not accepted.any():
-        return seeds
-    models = fit_models(moments, first, 0, planes=True)
-    # from every fourth row back to all rows
-    models.center[:, 1] = models.center[:, 1] * ROW_STEP + ROW_STEP // 2
-    models.coef[..., 1] /= ROW_STEP
-    marks = np.empty_like(signals.flags)
-    over_bands(
-        len(marks),
-        lambda _, a, b: _mark(
-            signals.image, signals.flags, edges, within, accepted, models, signals.law, signals.color_eps2,
-            cut, a, b, marks,
-        ),
-    )  # fmt: skip
-    label_parts(seeds, seeds.copy(), marks, within, WIDE_WINDOWS_PX[-1] ** 2, 1, 1)
-    return seeds
 
 
 @cache
@@ -447,9 +356,9 @@ def initial_partition(
     bands = max(1, min(BANDS, height // BAND_PX)) if config.fit == "auto" else 1
     rows = [height * i // bands for i in range(bands + 1)]
     counts = [0] * bands
-    plain = None
+    plain, found = labels, 0
     if within is not None and config.fit == "auto":
-        plain = plain_surfaces(signals, edges, within, cuts[1])
+        plain, found = plain_surfaces(signals, blocked, within, cuts[1], NOISE_FACTOR)
         blocked |= plain > 0
 
     def place(i: int) -> None:
@@ -463,6 +372,6 @@ def initial_partition(
     for i in range(1, bands):
         _renumber(labels, rows[i], rows[i + 1], sum(counts[:i]))
     total = sum(counts)
-    if plain is not None:
-        total += _add(labels, plain, total)
-    return labels, total
+    if found:
+        _add(labels, plain, total)
+    return labels, total + found
