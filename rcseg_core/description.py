@@ -15,29 +15,61 @@ from numpy.typing import NDArray
 from rcseg_core.adjacency import Pairs
 from rcseg_core.bezier import BezierPatch, jets, monomials_to_bernstein
 from rcseg_core.frame import PinholeCamera, RangeColorFrame
-from rcseg_core.jit import kernel
+from rcseg_core.jit import bare
 from rcseg_core.models import Models
 from rcseg_core.moments import UNIT_PX, Moments, tensor_exponents
+from rcseg_core.parallel import BANDS, over_bands
 from rcseg_core.segmentation import Region
 from rcseg_core.signals import Signals
 
 
-@kernel
-def _sums(points, image, flags, labels, n_range, centroid, products):  # type: ignore[no-untyped-def]
-    """Sums of the measured points (N + 1, 4: x, y, z, n) and of channel products within each modality."""
-    height, width, channels = image.shape
-    for row in range(height):
-        for col in range(width):
+@bare
+def _sums(points, image, flags, labels, n_range, first, last, run, centroid, products):  # type: ignore[no-untyped-def]
+    """Over rows first..last-1 the sums of the measured points (N + 1, 4: x, y, z, n) and of channel products
+    within each modality; run : (C + 1, C + 4) scratch, the sums of one run of a label."""
+    width, channels = image.shape[1], image.shape[2]
+    for row in range(first, last):
+        col = 0
+        while col < width:
             k = labels[row, col]
-            if k <= 0 or flags[row, col] != 0:
+            if k <= 0:
+                col += 1
                 continue
-            for c in range(3):
-                centroid[k, c] += points[row, col, c]
-            centroid[k, 3] += 1.0
+            run[:, :] = 0.0
+            while col < width and labels[row, col] == k:
+                if flags[row, col] == 0:
+                    for c in range(3):
+                        run[channels, c] += points[row, col, c]
+                    run[channels, 3] += 1.0
+                    for a in range(channels):
+                        value = np.float64(image[row, col, a])
+                        for b in range(0 if a < n_range else n_range, a + 1):
+                            run[a, b] += value * image[row, col, b]
+                col += 1
+            for c in range(4):
+                centroid[k, c] += run[channels, c]
             for a in range(channels):
-                first = 0 if a < n_range else n_range
-                for b in range(first, a + 1):
-                    products[k, a, b] += np.float64(image[row, col, a]) * np.float64(image[row, col, b])
+                for b in range(a + 1):
+                    products[k, a, b] += run[a, b]
+
+
+def _measured(
+    frame: RangeColorFrame, signals: Signals, labels: NDArray[np.int32], count: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Sums of `_sums` over the whole image: (N + 1, 4) and (N + 1, C, C)."""
+    channels = signals.image.shape[2]
+    centroid = np.zeros((BANDS, count + 1, 4))
+    products = np.zeros((BANDS, count + 1, channels, channels))
+    run = np.empty((BANDS, channels + 1, channels + 4))
+
+    def sum_band(i: int, first: int, last: int) -> None:
+        _sums(
+            frame.points, signals.image, signals.flags, labels, signals.n_range, first, last, run[i],
+            centroid[i], products[i],
+        )  # fmt: skip
+
+    over_bands(labels.shape[0], sum_band)
+    return centroid.sum(axis=0), products.sum(axis=0)
 
 
 def _inverse_grams(moments: Moments, members: NDArray[np.int64], degree: int) -> NDArray[np.float64]:
@@ -142,10 +174,7 @@ def describe_regions(
 ) -> list[Region]:  # fmt: skip
     """All regions, in the order of their labels."""
     count = boxes.shape[0] - 1
-    channels = signals.image.shape[2]
-    centroid = np.zeros((count + 1, 4))
-    products = np.zeros((count + 1, channels, channels))
-    _sums(frame.points, signals.image, signals.flags, labels, signals.n_range, centroid, products)
+    centroid, products = _measured(frame, signals, labels, count)
     range_patches = build_patches(moments, models, boxes, products, signals, 0)
     color_patches = build_patches(moments, models, boxes, products, signals, 1)
     neighbors: list[list[int]] = [[] for _ in range(count + 1)]

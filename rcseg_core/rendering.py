@@ -13,6 +13,7 @@ from rcseg_core.frame import PinholeCamera
 from rcseg_core.jit import bare
 from rcseg_core.models import Models
 from rcseg_core.moments import UNIT_PX
+from rcseg_core.parallel import BANDS, over_bands
 from rcseg_core.signals import Signals
 
 
@@ -30,11 +31,14 @@ def _along_row(models, k, row, n_range, line):  # type: ignore[no-untyped-def]
 
 
 @bare
-def _render(models, labels, n_range, scale, offset, lens, line, points, color):  # type: ignore[no-untyped-def]
-    """Fill points and color; lens: (fx, fy, cx, cy) where range channel 0 is inverse depth, else fx = 0."""
-    height, width = labels.shape
-    channels = line.shape[0]
-    for row in range(height):
+def _render(models, labels, n_range, scale, offset, lens, first, last, line, points, color):  # type: ignore[no-untyped-def]
+    """Fill rows first..last-1 of points and color.
+
+    lens : (fx, fy, cx, cy) where range channel 0 is inverse depth, else fx = 0
+    line : (C, D + 1) scratch
+    """
+    width, channels = labels.shape[1], line.shape[0]
+    for row in range(first, last):
         known = 0
         for col in range(width):
             k = labels[row, col]
@@ -86,6 +90,13 @@ def render(
         lens[:] = camera.fx, camera.fy, camera.cx, camera.cy
     points = np.empty((*labels.shape, 3), np.float32)
     color = np.empty((*labels.shape, 3), np.uint8)
-    line = np.empty((channels, models.coef.shape[2]))
-    _render(models, labels, signals.n_range, signals.scale, signals.offset, lens, line, points, color)
+    line = np.empty((BANDS, channels, models.coef.shape[2]))
+
+    def render_band(i: int, first: int, last: int) -> None:
+        _render(
+            models, labels, signals.n_range, signals.scale, signals.offset, lens, first, last, line[i],
+            points, color,
+        )  # fmt: skip
+
+    over_bands(labels.shape[0], render_band)
     return points, color

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rcseg_core import RangeColorFrame, Segmentation
+from rcseg_core.extents import region_extents
 from rcseg_ros.outputs import Make
 from rcseg_ros.patches import bernstein
-from rcseg_ros.region_statistics import region_statistics
 
 PATCH_KINDS = {"inverse_depth": 1, "xyz": 2, "rgb": 3}  # the constants of BezierPatch.msg
 
@@ -47,11 +47,11 @@ def region_array(
     """
     if surface is None:
         surface, _ = result.reconstruct()
-    statistics = region_statistics(frame.color, result.labels, result.regions, surface)
-    quaternions = Rotation.from_matrix(statistics.axes).as_quat() if len(result.regions) else np.empty((0, 4))
+    extents = region_extents(frame.color, result.labels, result.regions, surface)
+    quaternions = Rotation.from_matrix(extents.axes).as_quat() if len(result.regions) else np.empty((0, 4))
     columns = zip(
-        result.regions, quaternions.tolist(), statistics.center.tolist(), statistics.size.tolist(),
-        statistics.mean_color.astype(np.float32), _range_sigmas(result), strict=True,
+        result.regions, quaternions.tolist(), extents.center.tolist(), extents.size.tolist(),
+        extents.mean_color.astype(np.float32), _range_sigmas(result), strict=True,
     )  # fmt: skip
     regions = [
         make(

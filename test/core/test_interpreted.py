@@ -15,7 +15,7 @@ from rcseg_core.synthetic import make_scene
 #: Tests of kernels on small arrays; those of whole frames would take minutes without the compiler.
 KERNEL_TESTS = (
     "moments", "planes", "adjacency", "evidence", "grouping", "models", "continuity", "hierarchy", "cleaning",
-    "generalization", "partition", "rendering", "shapes",
+    "generalization", "partition", "rendering", "shapes", "extents",
 )  # fmt: skip
 SLOW = "vga or noise_alone or null_hypothesis or pure_noise or many_small or as_large_as_they_say"
 

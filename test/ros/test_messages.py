@@ -9,12 +9,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from rcseg_core import BezierPatch, PinholeCamera, RangeColorFrame, Region, SegmenterConfig, segment
+from rcseg_core import PinholeCamera, RangeColorFrame, SegmenterConfig, segment
 from rcseg_ros.conversions import Header
 from rcseg_ros.messages import region_array
 from rcseg_ros.outputs import header_message
 from rcseg_ros.patches import evaluate_patch, surface_points
-from rcseg_ros.region_statistics import region_statistics
 from rcseg_ros.result_bag import make_message, serialize
 
 MSG = Path(__file__).parents[2] / "rcseg_msgs" / "msg"
@@ -117,42 +116,6 @@ def test_the_merge_tree_cuts_as_the_core_does(case):
         expected = result.labels_at(level)
         pairs = {(int(a), int(b)) for a, b in zip(image.ravel(), expected.ravel(), strict=True)}
         assert len(pairs) == len({a for a, _ in pairs}) == len({b for _, b in pairs}), "another partition"
-
-
-def _region(label, control, domain, measured=True):
-    """A region of a scanner grid whose surface is a first-degree patch with these corner points."""
-    patch = BezierPatch("xyz", 1, control, np.zeros_like(control), np.eye(3), domain)
-    centroid = np.zeros(3) if measured else np.full(3, np.nan)
-    return Region(label, 1, 1, domain, centroid, np.zeros(3), (), patch, patch)
-
-
-def test_statistics_of_a_known_rectangle():
-    """A 2 x 1 m rectangle turned by 30 degrees, impulses among its points; a region without any."""
-    angle = np.deg2rad(30)
-    turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
-    corners = np.array([[(-1, -0.5, 0), (-1, 0.5, 0)], [(1, -0.5, 0), (1, 0.5, 0)]]) @ turn.T + (
-        0.3,
-        -0.2,
-        4.0,
-    )
-    control = np.moveaxis(corners, 2, 0)
-    labels = np.ones((60, 80), np.int32)
-    labels[:, 40:] = 2
-    points = np.full((60, 80, 3), 4.0, np.float32)
-    points[::7, ::5] = 40.0  # impulses: the box goes round the surface
-    frame = RangeColorFrame(points, np.full((60, 80, 3), (10, 20, 30), np.uint8))
-    regions = [_region(1, control, (0, 0, 59, 39)), _region(2, control, (0, 40, 59, 79), measured=False)]
-    rows, cols = np.mgrid[:60, :80]
-    surface = regions[0].range_patch.evaluate(rows, cols)
-    statistics = region_statistics(frame.color, labels, regions, surface)
-    np.testing.assert_allclose(statistics.size[0], (2.0, 1.0, 0.0), atol=1e-9)
-    np.testing.assert_allclose(statistics.center[0], (0.3, -0.2, 4.0), atol=1e-9)
-    np.testing.assert_allclose(abs(statistics.axes[0].T @ turn), np.eye(3), atol=1e-9)
-    assert np.linalg.det(statistics.axes[0]) == pytest.approx(1)
-    assert statistics.axes[0][2, 2] < 0, "z towards the sensor"
-    np.testing.assert_allclose(statistics.mean_color, [(10, 20, 30)] * 2)
-    assert np.isnan(statistics.size[1]).all() and np.isnan(statistics.center[1]).all()
-    np.testing.assert_array_equal(statistics.axes[1], np.eye(3))
 
 
 def test_markers_draw_every_region(case):
