@@ -71,7 +71,9 @@ def replay(
     outputs: Annotated[str, typer.Option(help="What to write, separated by commas.")] = "all",
     overlays: Annotated[bool, typer.Option("--overlays", help="Write a PNG of each frame too.")] = False,
     force: Force = False,
-    workers: Annotated[int, typer.Option(min=1, max=64, help="Frames that are segmented at once.")] = 1,
+    workers: Annotated[
+        int, typer.Option(min=0, max=64, help="Frames segmented at once; 0: as many as there are processors.")
+    ] = 0,
     max_frames: Annotated[Optional[int], typer.Option(min=1, help="Stop after so many.")] = None,  # noqa: UP045
 ) -> None:
     """Segment a recording: a result bag, metrics.json, config.yaml and a table."""

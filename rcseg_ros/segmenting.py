@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, is_dataclass
-from time import perf_counter
+from time import perf_counter, thread_time
 from typing import Any
 
 import numpy as np
@@ -69,11 +69,11 @@ class FrameWork:
         except InputError as error:
             reason = error.reason if isinstance(error, MessageError) else "unusable_frame"
             return FrameResult(raw.log_ns, {}, rejected=reason, error=str(error))
-        start = perf_counter()
+        start, start_cpu = perf_counter(), thread_time()
         result = segment(frame, self.config)
-        seconds = perf_counter() - start
+        seconds, cpu = perf_counter() - start, thread_time() - start_cpu
         header = header_of(range_message)
-        row = frame_row(header, pair.offset_ns, frame, result, seconds)
+        row = frame_row(header, pair.offset_ns, frame, result, seconds) | {"segment_cpu_ms": cpu * 1e3}
         row |= self._compare(pair.stamp_ns, result)
         messages = ResultMessages(header, frame, result, make_message)
         outputs = tuple(_serialized(name, getattr(messages, name)) for name in self.outputs)

@@ -167,13 +167,22 @@ def _notes(request: ReplayRequest, summary: ReplaySummary) -> str:
     lost = [f"{count} {reason}" for reason, count in (summary.rejected + summary.dropped).items()]
     lines = [
         f"from {', '.join(sources)}",
-        f"{len(summary.frames) / summary.seconds:.1f} frames/s with reading and writing",
+        _rate(summary),
         f"left out: {', '.join(lost)}" if lost else "nothing left out",
         f"results in {request.output}",
     ]
     if summary.first_error:
         lines.insert(3, f"first rejected frame: {summary.first_error}")
     return "\n".join(lines)
+
+
+def _rate(summary: ReplaySummary) -> str:
+    rate, most = summary.frames_per_second, summary.segment_only_per_second
+    workers = _count(summary.workers, "worker")
+    return (
+        f"{rate:.1f} frames/s with reading and writing, {rate / most:.0%} of the {most:.1f} that {workers} "
+        "could reach with segment() alone"
+    )
 
 
 def print_regions(result: Segmentation, folder: Path) -> None:

@@ -21,6 +21,7 @@ from recordings import (
 )
 
 from rcseg_core import InputError, SegmenterConfig, segment
+from rcseg_core.parallel import cores, threads
 from rcseg_ros.bag import Recording
 from rcseg_ros.conversions import decode_cloud, decode_image, decode_labels, header_of
 from rcseg_ros.outputs import labels_message
@@ -84,6 +85,11 @@ def test_metrics_and_configuration_are_complete(replayed, direct):
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics["totals"]["frames"] == 3 and metrics["damage"] == [] and not metrics["interrupted"]
     assert metrics["topics"]["range"] == DEPTH
+    totals = metrics["totals"]
+    assert totals["workers"] == cores()  # the default
+    assert totals["frames_per_second"] == pytest.approx(3 / totals["seconds"])
+    spent_ms = sum(row["segment_cpu_ms" if cores() > 1 else "segment_ms"] for row in metrics["frames"])
+    assert totals["segment_only_frames_per_second"] == pytest.approx(cores() * 3e3 / spent_ms)
     for row, result, stamp in zip(metrics["frames"], direct, stamps(3), strict=True):
         assert row["stamp_ns"] == stamp and row["regions"] == len(result.regions)
         assert row["stages_ms"].keys() == dict(result.timings).keys()
@@ -95,10 +101,12 @@ def test_metrics_and_configuration_are_complete(replayed, direct):
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize("workers", [2, 5])
+@pytest.mark.parametrize("workers", [1, 2, 5])
 def test_workers_change_nothing_but_time(workers, replayed, tmp_path):
     out, _ = replayed
-    run(write_mcap(tmp_path / "in.mcap", depth_entries(3)), tmp_path / "more", workers=workers)
+    before = threads(), cv2.getNumThreads()
+    summary = run(write_mcap(tmp_path / "in.mcap", depth_entries(3)), tmp_path / "more", workers=workers)
+    assert (summary.workers, threads(), cv2.getNumThreads()) == (workers, *before)
     with Recording(out) as one, Recording(tmp_path / "more") as more:
         topics = list(one.topics)
         assert list(more.topics) == topics
@@ -191,7 +199,7 @@ def test_a_fault_in_mid_run_leaves_what_was_finished(tmp_path, monkeypatch):
 
     monkeypatch.setattr("rcseg_ros.segmenting.segment", faulty)
     with pytest.raises(RuntimeError, match="fault"):
-        run(write_folder(tmp_path / "in", depth_entries(3)), tmp_path / "out")
+        run(write_folder(tmp_path / "in", depth_entries(3)), tmp_path / "out", workers=1)
     assert len(messages(tmp_path / "out", "labels")) == 2
     assert len(json.loads((tmp_path / "out" / "metrics.json").read_text())["frames"]) == 2
     assert sorted(p.name for p in tmp_path.iterdir()) == ["in", "out"]
