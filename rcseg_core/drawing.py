@@ -21,6 +21,13 @@ Image = NDArray[np.uint8]
 EDGE_COLORS: dict[int, tuple[int, int, int]] = {1: (255, 70, 70), 2: (80, 230, 80), 4: (90, 130, 255)}
 """Bits of the edge image: depth 1 red, orientation 2 green, colour 4 blue; together they add up."""
 BOUNDARY_COLOR = (255, 255, 255)
+KIND_COLORS: dict[str, tuple[int, int, int]] = {
+    "plane": (90, 130, 255),
+    "sphere": (80, 230, 80),
+    "cylinder": (255, 160, 40),
+    "none": (90, 90, 90),
+}
+"""Surfaces by the primitive that they are."""
 TITLE_HEIGHT_PX = 22
 
 
@@ -90,6 +97,20 @@ def edges_picture(edges: NDArray[np.uint8]) -> Image:
         mixed = sum((np.array(c) for bit, c in EDGE_COLORS.items() if value & bit), np.zeros(3, int))
         table[value, 0] = np.minimum(mixed, 255)
     return np.asarray(cv2.LUT(cv2.merge([edges] * 3), table), np.uint8)
+
+
+def kinds_picture(surface_labels: NDArray[Any], kinds: Sequence[str]) -> Image:
+    """Surfaces in the colours of `KIND_COLORS` with white boundaries, unlabelled black: (H, W, 3) uint8.
+
+    Parameters
+    ----------
+    surface_labels : (H, W) integer
+    kinds : kind of the surfaces 1 to M, in order
+    """
+    table = np.zeros((len(kinds) + 1, 3), np.uint8)
+    for label, kind in enumerate(kinds, start=1):
+        table[label] = KIND_COLORS[kind]
+    return _paint(table[surface_labels], boundaries(surface_labels), BOUNDARY_COLOR)
 
 
 def depth_picture(depth_m: NDArray[Any], *, low_m: float | None = None, high_m: float | None = None) -> Image:

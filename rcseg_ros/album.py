@@ -5,6 +5,7 @@ The page is plain HTML beside the pictures: it opens from the disk in any browse
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
@@ -20,6 +21,7 @@ from rcseg_core.drawing import (
     contact_sheet,
     depth_picture,
     edges_picture,
+    kinds_picture,
     labels_picture,
     overlay,
     write_png,
@@ -91,8 +93,9 @@ class Album:
 def frame_picture(
     case: Case, result: Segmentation, metrics: Sequence[SceneMetrics], tolerance: float
 ) -> Image:
-    """Image, depth, edges, regions, surfaces, reconstruction and truth side by side, RGB."""
+    """Image, depth, edges, regions, surfaces, primitives, reconstruction and truth side by side, RGB."""
     points, color = result.reconstruct()
+    kinds = [surface.primitive.kind for surface in result.surfaces]
     by_level = {m.level: m for m in metrics}
     range_name = "depth" if case.frame.camera is not None else "distance"
     distance = _distance(case.frame, case.frame.points)
@@ -109,6 +112,7 @@ def frame_picture(
         ("surfaces on the image", overlay(case.frame.color, result.surface_labels)),
         (regions, labels_picture(result.labels)),
         (surfaces, _with_blobs(labels_picture(result.surface_labels), blobs)),
+        (_count_kinds(kinds), kinds_picture(result.surface_labels, kinds)),
         ("reconstructed colour", color),
         (f"reconstructed {range_name}", depth_picture(_distance(case.frame, points), **limits)),
     ]
@@ -117,7 +121,12 @@ def frame_picture(
     if len(known) == 2 and known[0][1] is known[1][1]:
         known = [("truth", known[0][1])]
     panels += [(title, labels_picture(labels)) for title, labels in known]
-    return contact_sheet(panels, columns=4 if not known else 5)
+    return contact_sheet(panels, columns=5)
+
+
+def _count_kinds(kinds: Sequence[str]) -> str:
+    """How many surfaces are which primitive: plane blue, sphere green, cylinder orange, none grey."""
+    return "primitives: " + ", ".join(f"{count} {kind}" for kind, count in Counter(kinds).most_common())
 
 
 def _distance(frame: RangeColorFrame, points: Any) -> Any:

@@ -112,3 +112,14 @@ def test_png_files_come_back_as_they_were(tmp_path):
 def test_an_unwritable_png_is_one_clear_line(tmp_path):
     with pytest.raises(InputError, match=r"no/such/x\.png: cannot be written"):
         drawing.write_png(tmp_path / "no" / "such" / "x.png", np.zeros((2, 2, 3), np.uint8))
+
+
+def test_surfaces_are_painted_by_their_kind():
+    labels = np.zeros((6, 9), np.int32)
+    labels[:, 3:6], labels[:, 6:] = 1, 2
+    picture = drawing.kinds_picture(labels, ["sphere", "none"])
+    assert (picture[:, :2] == 0).all()
+    assert (picture[:, 3:5] == drawing.KIND_COLORS["sphere"]).all() and (
+        picture[:, 6:] == drawing.KIND_COLORS["none"]
+    ).all()
+    assert (picture[:, [2, 5]] == drawing.BOUNDARY_COLOR).all()

@@ -104,7 +104,7 @@ def test_recorded_frames_of_each_kind_of_truth(tmp_path, console):
     overview = cv2.imread(str(output / "overview.png"))
     assert overview.shape[1] == 3 * 320
     sheets = {n: cv2.imread(str(output / "pictures" / f"{n}.png")) for n in ("alone", "objects")}
-    assert sheets["alone"].shape[1] == 4 * 480 and sheets["objects"].shape[1] == 5 * 480
+    assert sheets["alone"].shape == sheets["objects"].shape and sheets["alone"].shape[1] == 5 * 480
 
 
 def test_both_levels_have_their_own_rows_and_pools(tmp_path, console):
