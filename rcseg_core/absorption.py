@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from rcseg_core.components import count_unassigned
 from rcseg_core.jit import bare
 from rcseg_core.models import Models, pixel_cost
+from rcseg_core.parallel import bands, over_bands
 from rcseg_core.signals import COLOR_OUTLIER, INVALID, RANGE_OUTLIER, Signals
 
 BUCKETS = 256
@@ -127,23 +128,27 @@ def _grow(image, flags, labels, leaves, within, models, n_range, law, color_eps2
 
 
 @bare
-def _refine(image, flags, labels, leaves, models, n_range, law, color_eps2, smoothness):  # type: ignore[no-untyped-def]
-    """One raster pass: each boundary pixel takes the label of least cost, smoothness included.
+def _refine(image, flags, labels, leaves, models, n_range, law, color_eps2, smoothness, first, last):  # type: ignore[no-untyped-def]
+    """One raster pass over rows: each boundary pixel takes the label of least cost, smoothness included.
 
     Returns the number of pixels that changed.
     """
     height, width = labels.shape
     moved = 0
-    for row in range(height):
+    for row in range(first, last):
         for col in range(width):
             k = labels[row, col]
             if k <= 0:
                 continue
+            up = labels[max(row - 1, 0), col]
+            down = labels[min(row + 1, height - 1), col]
+            left = labels[row, max(col - 1, 0)]
+            right = labels[row, min(col + 1, width - 1)]
             if (
-                labels[max(row - 1, 0), col] == k
-                and labels[min(row + 1, height - 1), col] == k
-                and labels[row, max(col - 1, 0)] == k
-                and labels[row, min(col + 1, width - 1)] == k
+                (up == k or up <= 0)
+                and (down == k or down <= 0)
+                and (left == k or left <= 0)
+                and (right == k or right <= 0)
             ):
                 continue
             best = k
@@ -152,21 +157,29 @@ def _refine(image, flags, labels, leaves, models, n_range, law, color_eps2, smoo
             for candidate in range(5):
                 r = row
                 c = col
-                if candidate < 4:
-                    r = row + (candidate == 1) - (candidate == 0)
-                    c = col + (candidate == 3) - (candidate == 2)
-                    if r < 0 or c < 0 or r >= height or c >= width:
-                        continue
-                m = labels[r, c]
+                m = k
+                if candidate == 0:
+                    m = up
+                    r = row - 1
+                elif candidate == 1:
+                    m = down
+                    r = row + 1
+                elif candidate == 2:
+                    m = left
+                    c = col - 1
+                elif candidate == 3:
+                    m = right
+                    c = col + 1
+                # each label once; its own comes last
                 if m <= 0 or (candidate < 4 and m == k):
                     continue
+                if (candidate == 1 and m == up) or (candidate == 2 and m in (up, down)):
+                    continue
+                if candidate == 3 and m in (up, down, left):
+                    continue
                 cost = pixel_cost(models, m, image, flags, row, col, n_range, law, color_eps2)
-                for i in range(-1, 2):
-                    for j in range(-1, 2):
-                        rr = row + i
-                        cc = col + j
-                        if rr < 0 or cc < 0 or rr >= height or cc >= width:
-                            continue
+                for rr in range(max(row - 1, 0), min(row + 2, height)):
+                    for cc in range(max(col - 1, 0), min(col + 2, width)):
                         if labels[rr, cc] > 0 and labels[rr, cc] != m:
                             cost += smoothness
                 if cost < best_cost or (cost == best_cost and m < best):
@@ -209,13 +222,27 @@ def refine(
     signals: Signals, labels: NDArray[np.int32], leaves: NDArray[np.int32], models: Models, passes: int
 ) -> int:
     """Move boundary pixels, in place, to the adjacent region that predicts them better; returns how many."""
+    height = len(labels)
+    rows = bands(height)
+    inner = [0] * len(rows)
+
+    def refine_rows(first: int, last: int) -> int:
+        moved: int = _refine(
+            signals.image, signals.flags, labels, leaves, models, signals.n_range, signals.law,
+            signals.color_eps2, SMOOTHNESS, first, last,
+        )  # fmt: skip
+        return moved
+
+    def refine_inside(i: int, first: int, last: int) -> None:
+        inner[i] = refine_rows(first + (i > 0), last - (i + 1 < len(rows)))
+
     total = 0
     for _ in range(passes):
-        moved = _refine(
-            signals.image, signals.flags, labels, leaves, models, signals.n_range, signals.law,
-            signals.color_eps2, SMOOTHNESS,
-        )  # fmt: skip
-        total += moved
-        if moved == 0:
+        # a pixel looks at the rows above and below: those between bands come after, so that all bands see the
+        # same whatever their order
+        over_bands(height, refine_inside)
+        between = sum(refine_rows(max(last - 1, first), last + 1) for first, last in rows[:-1])
+        total += sum(inner) + between
+        if sum(inner) + between == 0:
             break
     return total

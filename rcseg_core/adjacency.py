@@ -184,7 +184,7 @@ def find_pairs(
     group : (count + 1,) int64, optional; only pairs of one group are listed
     """
     cells, met = spread(labels, edges, (max_gap + 1) // 2)
-    size = 1 << int(np.ceil(np.log2(16 * (count + 16))))
+    size = 1 << int(np.ceil(np.log2(4 * (count + 64))))
     while (table := _count_pairs(cells, met, count, size)) is None:
         size *= 2
     keys, tally = table

@@ -99,7 +99,7 @@ def power_table(width: int) -> NDArray[np.float64]:
 
 @bare
 def _sum_channel(image, flags, row, start, stop, c, center, run):  # type: ignore[no-untyped-def]
-    """Sums of x^a s over the unflagged pixels of a run into run (5,); returns the sum of s^2."""
+    """Sums of x^a s over the unflagged pixels of a run into run (9,), and of s^2 into run[5]."""
     r0 = r1 = r2 = r3 = r4 = energy = 0.0
     for col in range(start, stop):
         x = (col - center) / UNIT_PX
@@ -119,12 +119,12 @@ def _sum_channel(image, flags, row, start, stop, c, center, run):  # type: ignor
     run[2] = r2
     run[3] = r3
     run[4] = r4
-    return energy
+    run[5] = energy
 
 
 @bare
-def _sum_three(image, flags, row, start, stop, c, center, runs, energy):  # type: ignore[no-untyped-def]
-    """The same for channels c, c + 1, c + 2 at once, up to x^2, into runs (3, 9); adds to energy (C,)."""
+def _sum_three(image, flags, row, start, stop, c, center, runs):  # type: ignore[no-untyped-def]
+    """The same for channels c, c + 1, c + 2 at once, up to x^2, into runs (3, 9)."""
     a0 = a1 = a2 = b0 = b1 = b2 = c0 = c1 = c2 = ea = eb = ec = 0.0
     for col in range(start, stop):
         weight = np.float64(flags[row, col] == 0)
@@ -147,9 +147,9 @@ def _sum_three(image, flags, row, start, stop, c, center, runs, energy):  # type
         a2 += u * x
         b2 += v * x
         c2 += w * x
-    energy[c] += ea
-    energy[c + 1] += eb
-    energy[c + 2] += ec
+    runs[0, 5] = ea
+    runs[1, 5] = eb
+    runs[2, 5] = ec
     runs[0, 0] = a0
     runs[0, 1] = a1
     runs[0, 2] = a2
@@ -162,59 +162,129 @@ def _sum_three(image, flags, row, start, stop, c, center, runs, energy):  # type
 
 
 @bare
-def _sum_runs(image, flags, labels, first, last, center, table, power, cross, energy, run):  # type: ignore[no-untyped-def]
-    """One pass over rows: a run of one label is summed in x, then spread over powers of y.
+def _add_run(image, flags, row, start, stop, k, sign, center, table, power, cross, energy, run):  # type: ignore[no-untyped-def]
+    """Add (sign 1) or take away (-1) a run: summed in x, then spread over powers of y.
 
     table : `power_table`; run : (3, 9) float64 scratch
     """
-    width, channels = image.shape[1], image.shape[2]
+    channels = image.shape[2]
     top = power.shape[1]
     low = cross.shape[2]
     middle = table.shape[0] // 2
+    origin = center[k, 0]
+    low_end = middle + np.int64(2 * (start - origin))
+    high_end = middle + np.int64(2 * (stop - origin))
+    for a in range(top):
+        run[0, a] = table[high_end, a] - table[low_end, a]
+    used = stop - start
+    for j in range(start, stop):
+        if flags[row, j] != 0:
+            used -= 1
+            x = (j - origin) / UNIT_PX
+            xa = 1.0
+            for a in range(top):
+                run[0, a] -= xa
+                xa *= x
+    if used == 0:
+        return
+    y = (row - center[k, 1]) / UNIT_PX
+    for a in range(top):
+        value = sign * run[0, a]
+        for b in range(top):
+            power[k, a, b] += value
+            value *= y
+    c = 0
+    while c < channels:
+        count = 3 if low <= 3 and c + 3 <= channels else 1
+        if count == 3:
+            _sum_three(image, flags, row, start, stop, c, origin, run)
+        else:
+            _sum_channel(image, flags, row, start, stop, c, origin, run[0])
+        for i in range(count):
+            energy[k, c + i] += sign * run[i, 5]
+            for a in range(low):
+                value = sign * run[i, a]
+                for b in range(low):
+                    cross[k, c + i, a, b] += value
+                    value *= y
+        c += count
+
+
+@bare
+def _sum_runs(image, flags, labels, first, last, center, table, power, cross, energy, run):  # type: ignore[no-untyped-def]
+    """One pass over rows first..last-1, a run of one label at a time."""
+    width = image.shape[1]
     for row in range(first, last):
         col = 0
         while col < width:
             k = labels[row, col]
             start = col
-            flagged = 0
+            col += 1
             while col < width and labels[row, col] == k:
-                flagged += flags[row, col] != 0
                 col += 1
-            if k <= 0 or flagged == col - start:
+            if k > 0:
+                _add_run(
+                    image, flags, row, start, col, k, 1.0, center, table, power, cross, energy, run
+                )  # fmt: skip
+
+
+@bare
+def _sum_moves(image, flags, before, after, center, table, power, cross, energy, run):  # type: ignore[no-untyped-def]
+    """The same for pixels whose label changed: away from the old one, to the new one."""
+    height, width = before.shape
+    for row in range(height):
+        col = 0
+        while col < width:
+            old = before[row, col]
+            new = after[row, col]
+            start = col
+            col += 1
+            if old == new:
                 continue
-            origin = center[k, 0]
-            low_end = middle + np.int64(2 * (start - origin))
-            high_end = middle + np.int64(2 * (col - origin))
-            for a in range(top):
-                run[0, a] = table[high_end, a] - table[low_end, a]
-            if flagged > 0:
-                for j in range(start, col):
-                    if flags[row, j] != 0:
-                        x = (j - origin) / UNIT_PX
-                        xa = 1.0
-                        for a in range(top):
-                            run[0, a] -= xa
-                            xa *= x
-            y = (row - center[k, 1]) / UNIT_PX
-            for a in range(top):
-                value = run[0, a]
-                for b in range(top):
-                    power[k, a, b] += value
-                    value *= y
-            c = 0
-            while c < channels:
-                count = 3 if low <= 3 and c + 3 <= channels else 1
-                if count == 3:
-                    _sum_three(image, flags, row, start, col, c, origin, run, energy[k])
-                else:
-                    energy[k, c] += _sum_channel(image, flags, row, start, col, c, origin, run[0])
-                for i in range(count):
-                    for a in range(low):
-                        value = run[i, a]
-                        for b in range(low):
-                            cross[k, c + i, a, b] += value
-                            value *= y
-                c += count
+            while col < width and before[row, col] == old and after[row, col] == new:
+                col += 1
+            if old > 0:
+                _add_run(
+                    image, flags, row, start, col, old, -1.0, center, table, power, cross, energy, run
+                )  # fmt: skip
+            if new > 0:
+                _add_run(
+                    image, flags, row, start, col, new, 1.0, center, table, power, cross, energy, run
+                )  # fmt: skip
+
+
+def _centers(boxes: NDArray[np.int64]) -> NDArray[np.float64]:
+    return np.stack([(boxes[:, 1] + boxes[:, 3]) / 2.0, (boxes[:, 0] + boxes[:, 2]) / 2.0], 1)
+
+
+def moved(
+    moments: Moments, image: NDArray[np.float32], flags: NDArray[np.uint8], before: NDArray[np.int32],
+    after: NDArray[np.int32], boxes: NDArray[np.int64],
+) -> Moments:  # fmt: skip
+    """Moments after pixels changed their regions: only those pixels are read. `moments` is used up.
+
+    Parameters
+    ----------
+    before, after : (H, W) int32, labels; `after` may hold regions that are new
+    flags : (H, W) uint8, for pixels with a label in `before` the same as then
+    boxes : (N + 1, 4) int64 of the regions of `after`; new regions get their centres from it
+    """
+    extra = len(boxes) - len(moments.energy)
+    center = np.concatenate([moments.center, _centers(boxes[len(boxes) - extra :])])
+    power, cross, energy = (np.concatenate([a, np.zeros((extra, *a.shape[1:]))]) for a in moments[1:])
+    _sum_moves(
+        image,
+        flags,
+        before,
+        after,
+        center,
+        power_table(after.shape[1]),
+        power,
+        cross,
+        energy,
+        np.empty((3, 9)),
+    )
+    return Moments(center, power, cross, energy)
 
 
 def accumulate(
@@ -231,7 +301,7 @@ def accumulate(
     """
     channels = image.shape[2]
     box = region_boxes(labels, count) if boxes is None else boxes
-    center = np.stack([(box[:, 1] + box[:, 3]) / 2.0, (box[:, 0] + box[:, 2]) / 2.0], 1)
+    center = _centers(box)
     top = 2 * degree + 1
     power = np.zeros((BANDS, count + 1, top, top))
     cross = np.zeros((BANDS, count + 1, channels, degree + 1, degree + 1))

@@ -17,7 +17,7 @@ from rcseg_core.grouping import Grouped
 from rcseg_core.hierarchy import TreeBuilder
 from rcseg_core.jit import bare
 from rcseg_core.models import Models
-from rcseg_core.moments import Moments, accumulate, region_boxes
+from rcseg_core.moments import Moments, accumulate, moved, region_boxes
 from rcseg_core.signals import Signals
 
 
@@ -91,19 +91,31 @@ class Partition:
         self.forget()
 
     def forget(self) -> None:
-        """Pixels have changed their regions: what was measured no longer holds."""
+        """What was measured no longer holds."""
         self._moments: Moments | None = None
+        #: labels of the pixels that the moments hold; the pixels that differ are added and taken away
+        self._counted: NDArray[np.int32] | None = None
+        self._pixels_changed()
+
+    def _pixels_changed(self) -> None:
         self._boxes: NDArray[np.int64] | None = None
         self._pairs: Pairs | None = None
+        self._current = False
 
     def moments(self, signals: Signals, degree: int) -> Moments:
         """Moments of the regions for models up to `degree` or more; grouping may add them up in place."""
-        kept = self._moments
-        if kept is None or kept.cross.shape[2] <= degree or kept.cross.shape[1] != signals.image.shape[2]:
+        kept, counted = self._moments, self._counted
+        fits = kept is not None and kept.cross.shape[2] > degree
+        fits = fits and kept is not None and kept.cross.shape[1] == signals.image.shape[2]
+        if not fits or kept is None or counted is None:
             kept = accumulate(
                 signals.image, signals.flags, self.labels, self.count, degree, self.boxes()
             )  # fmt: skip
-            self._moments = kept
+        elif not self._current:
+            kept = moved(kept, signals.image, signals.flags, counted, self.labels, self.boxes())
+        if not self._current or not fits:
+            self._counted = self.labels.copy()
+        self._moments, self._current = kept, True
         return kept
 
     def sizes(self) -> NDArray[np.int64]:
@@ -126,12 +138,12 @@ class Partition:
     def absorb(self, signals: Signals, models: Models, max_cost: float) -> None:
         """Grow the regions over unassigned pixels that they predict."""
         if absorb(signals, self.labels, self.leaves, models, max_cost, self.within):
-            self.forget()
+            self._pixels_changed()
 
     def refine(self, signals: Signals, models: Models, passes: int) -> None:
         """Let boundary pixels move to the region that predicts them better."""
         if refine(signals, self.labels, self.leaves, models, passes):
-            self.forget()
+            self._pixels_changed()
 
     def apply(self, grouped: Grouped) -> NDArray[np.int64]:
         """Carry out the merges: relabel, record. Returns the old label of each new region, (count + 1,)."""
@@ -153,6 +165,8 @@ class Partition:
         self.count = alive.size - 1
         if self._moments is not None:
             self._moments = Moments(*(a[alive] for a in self._moments))
+        if self._counted is not None:
+            relabel(self._counted, mapping)
         if self._boxes is not None:
             self._boxes = self._boxes[alive]
         if self._pairs is not None:
@@ -171,7 +185,7 @@ class Partition:
         self.nodes[inner] += extra
         self.nodes = np.concatenate([self.nodes, np.arange(old_leaves + 1, old_leaves + extra + 1)])
         self.count += extra
-        self.forget()
+        self._pixels_changed()
         return extra
 
     def drop_small(self, least: int) -> None:
