@@ -257,34 +257,37 @@ def _centers(boxes: NDArray[np.int64]) -> NDArray[np.float64]:
     return np.stack([(boxes[:, 1] + boxes[:, 3]) / 2.0, (boxes[:, 0] + boxes[:, 2]) / 2.0], 1)
 
 
-def moved(
+def extended(moments: Moments, boxes: NDArray[np.int64]) -> Moments:
+    """`moments` with empty rows for the regions behind its last; boxes : (N + 1, 4) int64 of all regions."""
+    old = len(moments.energy)
+    extra = len(boxes) - old
+    return Moments(
+        np.concatenate([moments.center, _centers(boxes[old:])]),
+        *(np.concatenate([a, np.zeros((extra, *a.shape[1:]))]) for a in moments[1:]),
+    )
+
+
+def move_pixels(
     moments: Moments, image: NDArray[np.float32], flags: NDArray[np.uint8], before: NDArray[np.int32],
-    after: NDArray[np.int32], boxes: NDArray[np.int64],
-) -> Moments:  # fmt: skip
-    """Moments after pixels changed their regions: only those pixels are read. `moments` is used up.
+    after: NDArray[np.int32],
+) -> None:  # fmt: skip
+    """Bring moments up to date, in place, after pixels changed their regions: only those pixels are read.
 
     Parameters
     ----------
-    before, after : (H, W) int32, labels; `after` may hold regions that are new
+    before, after : (H, W) int32, labels
     flags : (H, W) uint8, for pixels with a label in `before` the same as then
-    boxes : (N + 1, 4) int64 of the regions of `after`; new regions get their centres from it
     """
-    extra = len(boxes) - len(moments.energy)
-    center = np.concatenate([moments.center, _centers(boxes[len(boxes) - extra :])])
-    power, cross, energy = (np.concatenate([a, np.zeros((extra, *a.shape[1:]))]) for a in moments[1:])
     _sum_moves(
         image,
         flags,
         before,
         after,
-        center,
+        moments.center,
         power_table(after.shape[1]),
-        power,
-        cross,
-        energy,
+        *moments[1:],
         np.empty((3, 9)),
     )
-    return Moments(center, power, cross, energy)
 
 
 def accumulate(

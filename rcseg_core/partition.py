@@ -17,7 +17,7 @@ from rcseg_core.grouping import Grouped
 from rcseg_core.hierarchy import TreeBuilder
 from rcseg_core.jit import bare
 from rcseg_core.models import Models
-from rcseg_core.moments import Moments, accumulate, moved, region_boxes
+from rcseg_core.moments import Moments, accumulate, extended, move_pixels, region_boxes
 from rcseg_core.signals import Signals
 
 
@@ -112,7 +112,7 @@ class Partition:
                 signals.image, signals.flags, self.labels, self.count, degree, self.boxes()
             )  # fmt: skip
         elif not self._current:
-            kept = moved(kept, signals.image, signals.flags, counted, self.labels, self.boxes())
+            move_pixels(kept, signals.image, signals.flags, counted, self.labels)
         if not self._current or not fits:
             self._counted = self.labels.copy()
         self._moments, self._current = kept, True
@@ -186,6 +186,8 @@ class Partition:
         self.nodes = np.concatenate([self.nodes, np.arange(old_leaves + 1, old_leaves + extra + 1)])
         self.count += extra
         self._pixels_changed()
+        if self._moments is not None:
+            self._moments = extended(self._moments, self.boxes())
         return extra
 
     def drop_small(self, least: int) -> None:

@@ -351,9 +351,10 @@ def initial_partition(
         wide = [w for w in WIDE_WINDOWS_PX if top < w <= min(labels.shape)]
         sizes = np.concatenate([np.array(wide, np.int64), sizes])
     cuts = _chi2_cuts(signals.image.shape[2])
-    # windows keep to bands of rows, which are filled side by side; the literal form knows none
+    # on known surfaces windows keep to bands of rows, which are filled side by side; the surfaces themselves
+    # come out better without (docs/performance.md)
     height = len(labels)
-    bands = max(1, min(BANDS, height // BAND_PX)) if config.fit == "auto" else 1
+    bands = max(1, min(BANDS, height // BAND_PX)) if within is not None and config.fit == "auto" else 1
     rows = [height * i // bands for i in range(bands + 1)]
     counts = [0] * bands
     plain, found = labels, 0

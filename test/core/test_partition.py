@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from oracle.invariants import check_tree
 
 from rcseg_core.adjacency import find_pairs
-from rcseg_core.grouping import Grouped
+from rcseg_core.grouping import Grouped, add_merged
 from rcseg_core.models import fit_models
-from rcseg_core.moments import accumulate, region_boxes
+from rcseg_core.moments import UNIT_PX, accumulate, region_boxes
 from rcseg_core.partition import Partition
 from rcseg_core.signals import INVALID
 
@@ -152,3 +152,51 @@ def test_small_regions_are_freed(least):
     check(partition)
     assert np.array_equal(partition.labels > 0, (sizes[before] >= least) & (before > 0))
     assert partition.count == (sizes[1:] >= least).sum()
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 10**6))
+def test_moments_follow_the_pixels(seed):
+    """Whatever moves pixels between two measurements, the sums are those of the labels as they are."""
+    rng = np.random.default_rng(seed)
+    partition = Partition(seeds(seed, free=0.3), 8)
+    signals = crafted_signals(rng.normal(size=(*SHAPE, 4)), flags=rng.random(SHAPE) < 0.1)
+    for step in rng.permutation(6):
+        if step == 0:
+            partition.add_leftovers(np.zeros(SHAPE, np.uint8), 2)
+        elif step == 1:
+            partition.drop_small(int(rng.integers(1, 20)))
+        elif step == 2:
+            models = fit_models(
+                partition.moments(signals, 2), np.ones((partition.count + 1, 2), np.int64), signals.n_range
+            )
+            partition.absorb(signals, models, 50.0)
+        elif step == 3:
+            models = fit_models(
+                partition.moments(signals, 1), np.ones((partition.count + 1, 2), np.int64), signals.n_range
+            )
+            partition.refine(signals, models, 2)
+        elif step == 4:
+            partition.moments(signals, int(rng.integers(1, 5)))
+        elif partition.count > 2:
+            moments = partition.moments(signals, 2)
+            merges = np.array([[1, 2]])
+            add_merged(moments, merges)
+            partition.apply(grouped((1, 2)))
+    carried = partition.moments(signals, 2)
+    degree = carried.cross.shape[2] - 1
+    image, labels = signals.image.astype(float), partition.labels
+    used = signals.flags == 0
+    for k in range(1, partition.count + 1):
+        rows, cols = np.nonzero((labels == k) & used)
+        x, y = (cols - carried.center[k, 0]) / UNIT_PX, (rows - carried.center[k, 1]) / UNIT_PX
+        for a in range(2 * degree + 1):
+            for b in range(2 * degree + 1):
+                np.testing.assert_allclose(carried.power[k, a, b], (x**a * y**b).sum(), atol=1e-9)
+        for c in range(4):
+            values = image[rows, cols, c]
+            np.testing.assert_allclose(carried.energy[k, c], (values**2).sum(), atol=1e-9)
+            for a in range(degree + 1):
+                for b in range(degree + 1):
+                    wanted = (x**a * y**b * values).sum()
+                    np.testing.assert_allclose(carried.cross[k, c, a, b], wanted, atol=1e-9)
