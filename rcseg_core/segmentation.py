@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -13,7 +13,7 @@ from rcseg_core.bezier import BezierPatch
 from rcseg_core.cells import gather_cells
 from rcseg_core.frame import PinholeCamera
 from rcseg_core.grouping import Grouped
-from rcseg_core.hierarchy import Hierarchy, TreeBuilder
+from rcseg_core.hierarchy import Hierarchy, Scale, TreeBuilder, join_heights
 from rcseg_core.models import Models
 from rcseg_core.moments import region_boxes
 from rcseg_core.noise import NoiseModel
@@ -36,6 +36,7 @@ class Region:
     normal : (3,) float64, unit normal of the range patch at the middle of the region, towards the sensor
     neighbors : labels of the regions that touch this one, ascending
     range_patch, color_patch : BezierPatch
+    persistence : how long it lasts along the merge tree, see there
     """
 
     label: int
@@ -47,6 +48,16 @@ class Region:
     neighbors: tuple[int, ...]
     range_patch: BezierPatch
     color_patch: BezierPatch
+    lifetimes: Callable[[], NDArray[np.float64]] | None = field(default=None, repr=False, compare=False)
+
+    @property
+    def persistence(self) -> float:
+        """Level at which the region merges into a larger one over that at which it comes to be; 1 or more.
+
+        inf where it never merges. A level below that of one sigma of noise counts as that of one sigma
+        (`Scale.noise_level`), since there is nothing to see at it. NaN for a region of no segmentation.
+        """
+        return float("nan") if self.lifetimes is None else float(self.lifetimes()[self.label])
 
 
 @dataclass(frozen=True)
@@ -109,7 +120,34 @@ class Segmentation:
     @cached_property
     def regions(self) -> Sequence[Region]:
         """All regions, ``regions[i].label == i + 1``; described on first use."""
-        return self.describe()
+        return [replace(region, lifetimes=self.persistence) for region in self.describe()]
+
+    @cached_property
+    def scale(self) -> Scale:
+        """What the levels of the merge tree are in metres and in sigmas."""
+        signals = self.signals
+        typical = float(signals.offset[0])
+        if signals.inverse_depth:
+            depth_m, sigma_m = 1.0 / typical, float(signals.scale[0]) / typical**2  # dz = z^2 dw
+        else:
+            depth_m, sigma_m = float("nan"), float(np.sqrt(np.mean(signals.scale[: signals.n_range] ** 2)))
+        return Scale(depth_m, float(signals.law[3]) * sigma_m, sigma_m)
+
+    @cached_property
+    def _persistence(self) -> NDArray[np.float64]:
+        """(N + 1,) persistence of each region, see `Region.persistence`."""
+        count = len(self.nodes) - 1
+        birth = join_heights(self.tree, self.labels, self.leaves, count)
+        if self.range_tree is not None and self.range_leaves is not None:
+            birth = np.maximum(birth, join_heights(self.range_tree, self.labels, self.range_leaves, count))
+        parents = self.hierarchy.parents()[self.nodes]
+        heights = np.concatenate([[np.inf], np.zeros(self.hierarchy.leaf_count), self.hierarchy.heights])
+        # a region is one piece at level 1 whatever became of its border pixels
+        return np.asarray(heights[parents] / np.clip(birth, self.scale.noise_level, 1.0))
+
+    def persistence(self) -> NDArray[np.float64]:
+        """(N + 1,) persistence of regions 1..N, see `Region.persistence`; index 0 is of no meaning."""
+        return self._persistence
 
     @cached_property
     def surfaces(self) -> Sequence[Surface]:
@@ -137,7 +175,9 @@ class Segmentation:
         builder.merge(grouped.merges, above, self.nodes.copy())
         return builder.build()
 
-    def labels_at(self, level: float) -> NDArray[np.int32]:
+    def labels_at(
+        self, level: float | None = None, *, tolerance_m: float | None = None, sigmas: float | None = None
+    ) -> NDArray[np.int32]:
         """The partition at another approximation limit, without segmenting again.
 
         Parameters
@@ -145,6 +185,10 @@ class Segmentation:
         level : float >= 0
             Multiple of the configured tolerances: 1 is the result itself, 0 joins only what noise explains, 2
             allows twice the tolerance. Each step up only joins regions.
+        tolerance_m : float >= 0, in place of a level
+            The limit as a length at the median depth (`scale`), m; at half of that depth it is half of it.
+        sigmas : float >= 0, in place of a level
+            The limit as a multiple of the standard deviation of the range at the median depth.
 
         Returns
         -------
@@ -153,8 +197,12 @@ class Segmentation:
         Raises
         ------
         ValueError
-            For a negative or NaN level.
+            For a negative or NaN limit, or unless exactly one is given.
         """
+        if level is None:
+            level = self.scale.level(tolerance_m=tolerance_m, sigmas=sigmas)
+        elif tolerance_m is not None or sigmas is not None:
+            raise ValueError("give one of level, tolerance_m and sigmas")
         if not level >= 0:
             raise ValueError(
                 f"level = {level}: expected a multiple of the tolerance, 0 or more (1 is the result)"

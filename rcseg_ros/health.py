@@ -16,11 +16,25 @@ from typing import Any
 
 import numpy as np
 
+from rcseg_core import Segmentation
 from rcseg_ros.outputs import Make
 
 OK, WARN = b"\x00", b"\x01"  # constants of diagnostic_msgs/DiagnosticStatus
 WINDOW = 300  # latencies that the percentiles are taken over
 SILENCE_S = 5.0  # an active node that hears nothing for so long says so
+
+
+def noise_values(result: Segmentation) -> dict[str, str]:
+    """The noise that a frame was segmented with, for diagnostics: a sensor that degrades shows here first."""
+    noise, scale = result.noise, result.scale
+    values = {"noise.source": noise.source, "noise.range_sigma_mm": f"{1e3 * scale.sigma_m:.2f}"}
+    if np.isfinite(scale.depth_m):
+        values["noise.at_median_depth_m"] = f"{scale.depth_m:.2f}"
+    return values | {
+        "noise.range_correlation_px": f"{noise.range_correlation:.1f}",
+        "noise.color_sigma": " ".join(f"{sigma:.1f}" for sigma in noise.color),
+        "noise.color_correlation_px": f"{noise.color_correlation:.1f}",
+    }
 
 
 class Health:
@@ -35,6 +49,7 @@ class Health:
         self._latency_s: deque[float] = deque(maxlen=WINDOW)
         self._segment_s: deque[float] = deque(maxlen=WINDOW)
         self._published_at: deque[float] = deque(maxlen=WINDOW)
+        self._measured: dict[str, str] = {}
         self._heard_at = time.monotonic()
         self._reported: tuple[int, int] = (0, 0)
 
@@ -56,9 +71,15 @@ class Health:
                 self._warned_at[reason] = now
         return due
 
-    def published(self, latency_s: float, segment_s: float) -> None:
-        """Record a frame: from its last input's arrival to its labels' publication, and segment() alone."""
+    def published(
+        self, latency_s: float, segment_s: float, measured: Mapping[str, str] | None = None
+    ) -> None:
+        """Record a frame: from its last input's arrival to its labels' publication, and segment() alone.
+
+        measured : what the latest frame told of the sensor, see `noise_values`
+        """
         with self._lock:
+            self._measured = dict(measured or {})
             self._counts["segmented"] += 1
             self._latency_s.append(latency_s)
             self._segment_s.append(segment_s)
@@ -68,7 +89,8 @@ class Health:
         """Build the diagnostic_msgs/DiagnosticStatus of this moment; `drops` are the pairing's own counts."""
         with self._lock:
             counts = {**self._counts, **{f"dropped.{reason}": number for reason, number in drops.items()}}
-            values = {"state": state, **self._rates(), **{k: str(v) for k, v in sorted(counts.items())}}
+            values = {"state": state, **self._rates(), **self._measured}
+            values |= {k: str(v) for k, v in sorted(counts.items())}
             for reason, number in sorted(self._rejected.items()):
                 values[f"rejected.{reason}"] = f"{number} (last: {self._last_rejection[reason]})"
             level, message = self._summary(state)

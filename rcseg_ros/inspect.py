@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 from rich.table import Table
 
@@ -16,6 +17,14 @@ from rcseg_ros.conversions import header_of
 from rcseg_ros.result_bag import NAMESPACE
 
 REGIONS_TOPIC = f"{NAMESPACE}/regions"
+TABLE_WIDTH = 150
+_SHAPES: dict[int, tuple[str, tuple[tuple[str, int], ...]]] = {
+    0: ("none", ()),
+    1: ("plane", (("normal", 3), ("distance", 1))),
+    2: ("sphere", (("centre", 3), ("radius", 1))),
+    3: ("cylinder", (("point", 3), ("axis", 3), ("radius", 1))),
+}
+"""Name and parameters by the constants of Primitive.msg."""
 _KINDS = {1: "inverse depth", 2: "xyz", 3: "rgb"}
 
 
@@ -35,7 +44,12 @@ def inspect_bag(path: Path, frame: int | None, console: Console) -> None:
             return
         for index, message in enumerate(_region_arrays(recording)):
             if index == frame:
+                if console.width < TABLE_WIDTH:  # long lines are better than cut figures
+                    console = Console(file=console.file, width=TABLE_WIDTH, highlight=False)
                 console.print(_region_table(message, frame))
+                if hasattr(message, "surfaces"):  # recordings of older versions have none
+                    console.print(_surface_table(message))
+                    console.print(_noise_text(message))
                 return
         raise InputError(f"{path}: no frame {frame}; it has {recording.topics[REGIONS_TOPIC].count}, from 0")
 
@@ -76,6 +90,7 @@ def _region_table(message: Any, frame: int) -> Table:
         "normal",
         "range",
         "rms",
+        "lasts",
         "color",
     ):
         table.add_column(name, justify="right")
@@ -91,9 +106,58 @@ def _region_table(message: Any, frame: int) -> Table:
             _vector(region.normal),
             f"{_KINDS.get(patch.kind, '?')} {patch.degree}",
             f"{math.sqrt(max(float(patch.covariance[0]), 0.0)):.2g}",
+            f"{getattr(region, 'persistence', math.nan):.3g}",
             "({:.0f} {:.0f} {:.0f})".format(*region.mean_color),
         )
     return table
+
+
+def _surface_table(message: Any) -> Table:
+    title = f"{len(message.surfaces)} surfaces; metres, standard errors after +-"
+    table = Table(title=title, title_justify="left")
+    for name in ("surface", "pixels", "shape", "parameters", "rms", "rms/sigma", "misfit", "regions"):
+        table.add_column(name, justify="left" if name in ("shape", "parameters", "regions") else "right")
+    for surface in message.surfaces:
+        shape = surface.primitive
+        known = shape.kind != 0
+        labels = [str(label) for label in surface.regions]
+        table.add_row(
+            str(surface.label),
+            str(surface.pixel_count),
+            _SHAPES.get(shape.kind, ("?", ()))[0],
+            _shape_text(shape),
+            f"{shape.rms:.2g}" if known else "",
+            f"{shape.rms_sigma:.2f}" if known else "",
+            f"{shape.misfit:.2g}" if known else "",
+            " ".join(labels[:8]) + (f" and {len(labels) - 8} more" if len(labels) > 8 else ""),
+        )
+    return table
+
+
+def _shape_text(shape: Any) -> str:
+    """Names and values of the parameters; the standard error of each length, of a vector the largest."""
+    values = np.asarray(shape.parameters)
+    count = len(values)
+    errors = np.sqrt(np.maximum(np.diag(np.asarray(shape.covariance).reshape(count, count)), 0.0))
+    at, parts = 0, []
+    for name, size in _SHAPES.get(shape.kind, ("?", ()))[1]:
+        numbers = " ".join(f"{value:.3f}" for value in values[at : at + size])
+        shown = f"({numbers})" if size > 1 else f"{values[at]:.4f}"
+        parts.append(f"{name} {shown} +- {errors[at : at + size].max():.2g}")
+        at += size
+    return ", ".join(parts)
+
+
+def _noise_text(message: Any) -> str:
+    noise = message.noise
+    where = "" if math.isnan(noise.depth) else f" at the median depth of {noise.depth:.2f} m"
+    red, green, blue = noise.color_sigma
+    return (
+        f"noise ({noise.source}): range {1e3 * noise.sigma:.2f} mm{where}, "
+        f"{noise.range_correlation:.1f} px make one measurement; "
+        f"colour {red:.1f} {green:.1f} {blue:.1f} levels, {noise.color_correlation:.1f} px. "
+        f"Level 1 of the merge tree is {1e3 * noise.tolerance:.2f} mm there"
+    )
 
 
 def _vector(value: Any) -> str:

@@ -22,6 +22,7 @@ from rcseg_core.extents import region_extents
 from rcseg_ros.outputs import Make
 from rcseg_ros.patches import bernstein
 
+SHAPE_KINDS = {"none": 0, "plane": 1, "sphere": 2, "cylinder": 3}  # the constants of Primitive.msg
 PATCH_KINDS = {"inverse_depth": 1, "xyz": 2, "rgb": 3}  # the constants of BezierPatch.msg
 
 
@@ -69,6 +70,7 @@ def region_array(
                 orientation=make("geometry_msgs/msg/Quaternion", **dict(zip("xyzw", turn, strict=True))),
             ),
             extent_size=_xyz("Vector3", size, make),
+            persistence=region.persistence,
             mean_color=mean_color,
             range_patch=_bezier_patch(region.range_patch, range_sigma, make),
             color_patch=_bezier_patch(region.color_patch, result.noise.color, make),
@@ -83,7 +85,9 @@ def region_array(
         width=frame.width,
         k=np.ascontiguousarray(k, np.float64).reshape(9),
         regions=regions,
+        surfaces=[_surface(surface, make) for surface in result.surfaces],
         hierarchy=_merge_tree(result, make),
+        noise=_noise(result, make),
     )
 
 
@@ -148,6 +152,45 @@ def _bezier_patch(patch: Any, noise_sigma: Any, make: Make) -> Any:
 
 def _flat(values: Any) -> NDArray[np.float64]:
     return np.ascontiguousarray(values, np.float64).ravel()
+
+
+def _surface(surface: Any, make: Make) -> Any:
+    found = surface.primitive
+    values = [np.ravel(value) for value in found.parameters.values()]
+    return make(
+        "rcseg_msgs/msg/Surface",
+        label=surface.label,
+        pixel_count=surface.pixel_count,
+        pixels=_pixel_box(surface.box, make),
+        regions=np.array(surface.regions, np.uint32),
+        primitive=make(
+            "rcseg_msgs/msg/Primitive",
+            kind=SHAPE_KINDS[found.kind],
+            parameters=np.concatenate(values) if values else np.empty(0),
+            covariance=_flat(found.covariance),
+            convex=found.convex,
+            rms=found.rms_m,
+            rms_sigma=found.rms_sigma,
+            misfit=found.misfit_m,
+            p_value=found.p_value,
+        ),
+    )
+
+
+def _noise(result: Segmentation, make: Make) -> Any:
+    noise, scale = result.noise, result.scale
+    return make(
+        "rcseg_msgs/msg/Noise",
+        source=noise.source,
+        channels=len(noise.range_law),
+        range_law=_flat(noise.range_law),
+        range_correlation=float(noise.range_correlation),
+        depth=scale.depth_m,
+        sigma=scale.sigma_m,
+        tolerance=scale.tolerance_m,
+        color_sigma=_flat(noise.color),
+        color_correlation=float(noise.color_correlation),
+    )
 
 
 def _merge_tree(result: Segmentation, make: Make) -> Any:

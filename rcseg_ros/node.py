@@ -26,7 +26,7 @@ from rcseg_core.errors import ConfigError, RcsegError
 from rcseg_ros.assembly import assemble_frame
 from rcseg_ros.conversions import Header, header_of
 from rcseg_ros.extrinsic import TransformListener, rigid
-from rcseg_ros.health import Health
+from rcseg_ros.health import Health, noise_values
 from rcseg_ros.inputs import Inputs
 from rcseg_ros.manners import Interrupt, answer_impossible_transitions, told
 from rcseg_ros.messages import make_rcl
@@ -175,7 +175,9 @@ class SegmentationNode(LifecycleNode):
                 if self._active:
                     self._results.publish(
                         header, frame, result,
-                        lambda: self.health.published(time.monotonic() - task.arrived_s, segment_s),
+                        lambda: self.health.published(
+                            time.monotonic() - task.arrived_s, segment_s, noise_values(result)
+                        ),
                     )  # fmt: skip
         except Exception as error:
             if rclpy.ok():

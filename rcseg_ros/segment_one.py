@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rcseg_core import PinholeCamera, RangeColorFrame, Segmentation, SegmenterConfig, segment
 from rcseg_core.drawing import overlay, write_png
 from rcseg_core.errors import InputError
-from rcseg_ros.segmenting import plain
+from rcseg_ros.segmenting import noise_document, plain
 from rcseg_ros.staging import StagedFolder
 
 REGIONS = "regions.json"
@@ -97,12 +97,15 @@ def segment_to_folder(
 
 
 def regions_document(frame: RangeColorFrame, result: Segmentation) -> dict[str, Any]:
-    """All that is known of the regions as plain values; pixels, metres, grey levels; null where unknown."""
+    """All that is known of the regions as plain values; pixels, metres, grey levels.
+
+    null where unknown; a persistence of null is infinite: the region merges into no other.
+    """
     return {
         "height": frame.height,
         "width": frame.width,
         "camera_matrix": None if frame.camera is None else plain(frame.camera.matrix()),
-        "noise": plain(result.noise),
+        "noise": noise_document(result),
         "timings_s": plain(result.timings),
         "regions": [
             {
@@ -113,12 +116,38 @@ def regions_document(frame: RangeColorFrame, result: Segmentation) -> dict[str, 
                 "centroid_m": plain(region.centroid),
                 "normal": plain(region.normal),
                 "neighbors": plain(region.neighbors),
+                "persistence": plain(region.persistence),
                 "range_patch": _patch(region.range_patch),
                 "color_patch": _patch(region.color_patch),
             }
             for region in result.regions
         ],
+        "surfaces": [
+            {
+                "label": surface.label,
+                "pixel_count": surface.pixel_count,
+                "box": plain(surface.box),
+                "regions": plain(surface.regions),
+                "primitive": _primitive(surface.primitive),
+            }
+            for surface in result.surfaces
+        ],
     }
+
+
+def _primitive(found: Any) -> dict[str, Any]:
+    """A recognised shape; the covariance is of its parameters in their order, null values are unknown."""
+    names = (
+        "parameters",
+        "standard_errors",
+        "covariance",
+        "convex",
+        "rms_m",
+        "rms_sigma",
+        "misfit_m",
+        "p_value",
+    )
+    return {"kind": found.kind} | {name: plain(getattr(found, name)) for name in names}
 
 
 def _patch(patch: Any) -> dict[str, Any]:

@@ -117,7 +117,23 @@ def frame_row(
         "surfaces": int(result.surface_labels.max(initial=0)),
         "segment_ms": seconds * 1e3,
         "stages_ms": {stage: value * 1e3 for stage, value in result.timings.items()},
-        "noise": plain(result.noise),
+        "noise": noise_document(result),
+    }
+
+
+def noise_document(result: Segmentation) -> dict[str, Any]:
+    """The noise of a frame as plain values: its law, and what that is at the median depth.
+
+    ``range_law``: sigma = a + b s + c s^2 of the signal s for each range channel, in ``range_unit``;
+    ``color``: standard deviations in grey levels; correlations in pixels; ``median_depth_m``: null for
+    scanner grids; ``sigma_m``, ``tolerance_m``: standard deviation of range and approximation limit there.
+    """
+    scale = result.scale
+    return plain(result.noise) | {
+        "range_unit": "1/m" if result.signals.inverse_depth else "m",
+        "median_depth_m": plain(scale.depth_m),
+        "sigma_m": plain(scale.sigma_m),
+        "tolerance_m": plain(scale.tolerance_m),
     }
 
 

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracle.invariants import check_tree, joins_only
 
-from rcseg_core.hierarchy import Hierarchy, TreeBuilder
+from rcseg_core.hierarchy import Hierarchy, TreeBuilder, join_heights
 
 
 def random_tree(seed, leaves=12, merges=8, late=3):
@@ -98,3 +98,20 @@ def test_nodes_of_the_tree_can_be_cut_as_well_as_leaves(level):
     cut = tree.cut(level)
     assert cut.shape == (tree.node_count + 1,)
     assert (cut >= np.arange(tree.node_count + 1)).all()
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 10**6))
+def test_labels_hang_together_from_their_join_height_on(seed):
+    """Against cuts: below the height the pixels of a label are in several parts, from it on in one."""
+    tree = random_tree(seed)[0].build()
+    rng = np.random.default_rng(seed + 1)
+    leaves = rng.integers(0 if seed % 3 == 0 else 1, tree.leaf_count + 1, (6, 7)).astype(np.int32)
+    labels = np.where(rng.random((6, 7)) < 0.2, 0, leaves % 4).astype(np.int32)
+    heights = join_heights(tree, labels, leaves, 4)
+    assert heights[4] == np.inf, "no pixel, no height"
+    for label in range(1, 4):
+        members = leaves[labels == label]
+        for level in (0.0, *tree.heights):
+            together = len(np.unique(tree.cut(level)[members])) == 1 if members.size else False
+            assert together == (heights[label] <= level), (label, level)

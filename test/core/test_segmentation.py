@@ -61,6 +61,96 @@ def test_a_wide_limit_joins_all_that_touches_unless_edges_forbid_it(criterion):
     assert segment(scene.frame, SegmenterConfig().replace(changes)).labels_at(1e8).max() <= 2
 
 
+@pytest.mark.parametrize("family", ["room", "billiard"])
+@pytest.mark.parametrize("name", ["default", "joint"])
+def test_a_length_is_a_level_and_longer_ones_only_join(family, name):
+    result = segment(make_scene(family, 4, width=128, height=96).frame, CONFIGS[name])
+    scale = result.scale
+    lengths = scale.tolerance_m * np.array([0.0, 0.1, 0.4, 1.0, 2.0, 5.0, 40.0])
+    cuts = [result.labels_at(tolerance_m=length) for length in lengths]
+    assert all(joins_only(fine, coarse) for fine, coarse in pairwise(cuts))
+    assert cuts[0].max() > cuts[-1].max(), "the lengths span something"
+    assert np.array_equal(cuts[3], result.labels)
+    for length, cut in zip(lengths, cuts, strict=True):
+        assert np.array_equal(cut, result.labels_at(length / scale.tolerance_m))
+        assert np.array_equal(cut, result.labels_at(sigmas=length / scale.sigma_m))
+
+
+def test_the_scale_is_that_of_the_frame_and_the_configuration():
+    config = SegmenterConfig().replace({"grouping.range_tolerance": 0.006})
+    scene = make_scene("room", 4, width=128, height=96)
+    scale = segment(scene.frame, config).scale
+    depth = np.median(scene.frame.depth_m[scene.frame.valid])
+    assert scale.depth_m == pytest.approx(depth, rel=0.03)  # the median of a sixteenth of the pixels
+    assert scale.tolerance_m == pytest.approx(0.006 * scale.depth_m, rel=1e-6)
+    assert scale.sigma_m == pytest.approx(1.425e-3 * scale.depth_m**2, rel=0.3)
+    assert scale.level(tolerance_m=0.012 * scale.depth_m) == pytest.approx(2.0)
+    assert scale.level(sigmas=3.0) == pytest.approx(3 * scale.sigma_m / scale.tolerance_m)
+    assert scale.length_m(2.0) == pytest.approx(0.012 * scale.depth_m)
+    assert scale.sigmas(scale.level(sigmas=3.0)) == pytest.approx(3.0)
+
+
+def test_the_scale_of_a_scanner_grid_is_one_length():
+    scene = make_scene("painting", 4, width=128, height=96)
+    scale = segment(scene.frame).scale
+    low, high = np.quantile(scene.frame.points[scene.frame.valid], [0.02, 0.98], axis=0)
+    assert np.isnan(scale.depth_m)
+    assert scale.tolerance_m == pytest.approx(0.004 * np.linalg.norm(high - low), rel=1e-3)
+
+
+@pytest.mark.parametrize("given, says", [
+    ({}, "give one of"),
+    ({"level": 1.0, "sigmas": 1.0}, "give one of"),
+    ({"tolerance_m": 0.01, "sigmas": 1.0}, "give one of"),
+    ({"tolerance_m": -0.01}, "tolerance_m = -0.01: expected 0 or more"),
+    ({"sigmas": float("nan")}, "sigmas = nan: expected 0 or more"),
+])  # fmt: skip
+def test_a_scale_is_given_once_and_is_not_negative(result, given, says):
+    with pytest.raises(ValueError, match=says):
+        result.labels_at(**given)
+
+
+def test_without_tolerance_levels_have_no_length():
+    config = SegmenterConfig().replace({"grouping.range_tolerance": 0.0})
+    result = segment(make_scene("room", 4, width=96, height=72).frame, config)
+    with pytest.raises(ValueError, match=r"grouping.range_tolerance is 0"):
+        result.labels_at(tolerance_m=0.01)
+    assert all(region.persistence >= 1 for region in result.regions)
+
+
+@pytest.mark.parametrize("family, name", [("room", "default"), ("curved", "joint"), ("billiard", "default")])
+def test_persistence_is_what_the_levels_show(family, name):
+    """A region is one segment by itself from its birth up to its end, and not beyond either."""
+    result = segment(make_scene(family, 4, width=128, height=96).frame, CONFIGS[name])
+    floor = result.scale.noise_level
+    parents, tree = result.hierarchy.parents(), result.hierarchy
+    ends, births = set(), set()
+    for region in result.regions:
+        inside = result.labels == region.label
+
+        def alone(level, inside=inside):
+            groups = result.labels_at(level)
+            own = np.unique(groups[inside])
+            return own.size == 1 and (groups == own[0]).sum() == inside.sum()
+
+        parent = parents[result.nodes[region.label]]
+        end = tree.heights[parent - tree.leaf_count - 1] if parent else np.inf
+        birth = end / region.persistence if parent else None
+        assert region.persistence >= 1
+        assert (region.persistence == np.inf) == (parent == 0)
+        if parent == 0:
+            assert alone(1.0) and alone(1e9)
+            continue
+        assert floor - 1e-9 <= birth <= 1 + 1e-9
+        assert alone(end * (1 - 1e-9)) and not alone(end * (1 + 1e-9))
+        assert alone(min(birth * (1 + 1e-9), 1.0))
+        if floor + 1e-6 < birth < 1 - 1e-6:
+            assert not alone(birth * (1 - 1e-6))
+        ends.add(end)
+        births.add(round(birth, 6))
+    assert len(ends) >= 2, "this tests nothing if no region ends"
+
+
 def test_levels_give_copies(result):
     result.labels_at(1.0)[:] = 7
     result.labels_at(2.0)[:] = 7

@@ -46,6 +46,7 @@ def test_replay_of_the_bundled_sequence_with_truth(rcseg, tmp_path):
     (row,) = json.loads((tmp_path / "out" / "metrics.json").read_text())["frames"]
     assert row["truth"]["labels"]["truth_regions"] > 5
     assert row["truth"]["labels"]["voi_bits"] < 3
+    assert row["noise"]["source"] == "estimated" and 0 < row["noise"]["sigma_m"] < 0.05
 
 
 def test_inspect_lists_frames_and_regions(rcseg, tmp_path):
@@ -54,7 +55,10 @@ def test_inspect_lists_frames_and_regions(rcseg, tmp_path):
     text = rcseg("inspect", "out")
     assert "/rcseg/regions" in text and "rcseg_msgs/msg/RegionArray" in text and "1700000000.100" in text
     regions = len(segment(scene(1), SegmenterConfig()).regions)
-    assert f"frame 1: {regions} regions" in rcseg("inspect", "out", "--frame", 1)
+    shown = rcseg("inspect", "out", "--frame", 1)
+    assert f"frame 1: {regions} regions" in shown
+    assert "surfaces; metres" in shown and "plane" in shown and "normal (" in shown
+    assert "noise (estimated): range " in shown and " mm at the median depth of " in shown
 
 
 def check_results(folder, frame):
@@ -71,6 +75,25 @@ def check_results(folder, frame):
     assert first["pixel_count"] == (labels == 1).sum()
     np.testing.assert_array_equal(first["range_patch"]["control_points"], region.range_patch.control_points)
     np.testing.assert_array_equal(document["camera_matrix"], CAMERA.matrix())
+    ends = [r["persistence"] for r in document["regions"]]
+    assert ends == [None if r.persistence == np.inf else r.persistence for r in expected.regions]
+    assert len(document["surfaces"]) == surfaces.max()
+    for told, surface in zip(document["surfaces"], expected.surfaces, strict=True):
+        assert told["pixel_count"] == (surfaces == told["label"]).sum()
+        assert told["regions"] == list(surface.regions)
+        assert told["primitive"]["kind"] == surface.primitive.kind
+        for name, value in surface.primitive.parameters.items():
+            np.testing.assert_array_equal(told["primitive"]["parameters"][name], value)
+            np.testing.assert_array_equal(
+                told["primitive"]["standard_errors"][name], surface.primitive.standard_errors[name]
+            )
+    assert document["surfaces"][0]["primitive"]["kind"] == "plane"
+    noise = document["noise"]
+    depth, (a, b, c) = noise["median_depth_m"], noise["range_law"][0]
+    assert noise["source"] == "estimated" and noise["range_unit"] == "1/m"
+    assert noise["sigma_m"] == pytest.approx((a + b / depth + c / depth**2) * depth**2)
+    assert noise["tolerance_m"] == pytest.approx(0.004 * depth, rel=1e-6)
+    assert len(noise["color"]) == 3 and noise["range_correlation"] >= 1 and noise["color_correlation"] >= 1
 
 
 def test_segment_of_an_archive(rcseg, tmp_path):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from copy import copy
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -10,6 +12,7 @@ import numpy as np
 import pytest
 
 from rcseg_core import PinholeCamera, RangeColorFrame, SegmenterConfig, segment
+from rcseg_core.primitives import NONE
 from rcseg_ros.conversions import Header
 from rcseg_ros.messages import region_array
 from rcseg_ros.outputs import header_message
@@ -116,6 +119,73 @@ def test_the_merge_tree_cuts_as_the_core_does(case):
         expected = result.labels_at(level)
         pairs = {(int(a), int(b)) for a, b in zip(image.ravel(), expected.ravel(), strict=True)}
         assert len(pairs) == len({a for a, _ in pairs}) == len({b for _, b in pairs}), "another partition"
+
+
+def test_persistence_can_be_read_off_the_merge_tree(case):
+    _, result, message = case
+    parent, height = message.hierarchy.parent, message.hierarchy.height
+    for region, core in zip(message.regions, result.regions, strict=True):
+        above = int(parent[region.label - 1])
+        assert region.persistence == core.persistence
+        assert (region.persistence == np.inf) == (above == 0)
+        if above:  # born at level 1 at the latest
+            assert region.persistence >= height[above - 1] * (1 - 1e-12)
+
+
+def test_surfaces_hold_their_regions_and_a_shape(case):
+    _, result, message = case
+    assert [s.label for s in message.surfaces] == list(range(1, result.surface_labels.max() + 1))
+    for surface in message.surfaces:
+        inside = result.surface_labels == surface.label
+        assert surface.pixel_count == inside.sum()
+        assert set(surface.regions) == {r.label for r in message.regions if r.surface == surface.label}
+        assert all(message.regions[label - 1].surface == surface.label for label in surface.regions)
+    wall, box = message.surfaces[:2]
+    # the wall is z = 1 / (0.5 + 0.002 col): x, z with 1 = 0.5 z + 0.002 (130 x + 59.5 z)
+    normal = np.array([0.26, 0.0, 0.619]) / np.hypot(0.26, 0.619)
+    for shape, wanted, distance in (
+        (wall.primitive, -normal, -1 / np.hypot(0.26, 0.619)),
+        (box.primitive, (0, 0, -1), -1.1),
+    ):
+        assert shape.kind == 1 and shape.convex
+        np.testing.assert_allclose(shape.parameters[:3], wanted, atol=2e-3)
+        assert shape.parameters[3] == pytest.approx(distance, abs=2e-3)
+        covariance = np.reshape(shape.covariance, (4, 4))
+        assert np.all(np.linalg.eigvalsh(covariance) > -1e-12)
+        assert 1e-6 < np.sqrt(covariance[3, 3]) < 1e-3
+        assert 3e-4 < shape.rms < 2e-3 and 0.5 < shape.rms_sigma < 2
+
+
+def test_no_shape_is_told_as_none(case):
+    frame, result, _ = case
+    shapeless = [replace(surface, primitive=NONE) for surface in result.surfaces]
+    other = copy(result)
+    other.__dict__["surfaces"] = shapeless
+    message = region_array(frame, other, header_message(Header(5, "f"), make_message), make_message)
+    assert len(message.surfaces) == len(shapeless) > 0
+    for surface in message.surfaces:
+        shape = surface.primitive
+        assert shape.kind == len(shape.parameters) == len(shape.covariance) == 0
+        assert np.isnan([shape.rms, shape.rms_sigma, shape.misfit, shape.p_value]).all()
+
+
+def test_the_noise_is_told_with_its_unit(case):
+    frame, result, message = case
+    noise = message.noise
+    assert noise.source == "estimated"
+    assert len(noise.range_law) == 3 * noise.channels == 3 * (1 if frame.camera else 3)
+    assert noise.range_correlation >= 1 and noise.color_correlation >= 1
+    if frame.camera:
+        depth = np.nanmedian(frame.depth_m)
+        assert noise.depth == pytest.approx(depth, rel=0.05)
+        a, b, c = noise.range_law
+        sigma_w = a + b / noise.depth + c / noise.depth**2
+        assert noise.sigma == pytest.approx(sigma_w * noise.depth**2, rel=1e-6)
+        assert noise.tolerance == pytest.approx(0.004 * noise.depth, rel=1e-6)
+    else:
+        assert np.isnan(noise.depth)
+    assert 5e-4 < noise.sigma < 2e-3  # 1 mm was added
+    np.testing.assert_array_equal(noise.color_sigma, result.noise.color)
 
 
 def test_markers_draw_every_region(case):

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from rcseg_core import RangeColorFrame
+from rcseg_core import RangeColorFrame, SegmenterConfig, segment
 
 stamps = itertools.count(1_700_000_000_000_000_000, 1_000_000_000)
 
@@ -37,6 +37,27 @@ def test_every_output_carries_the_inputs_stamp_and_frame(live, peer, frame, labe
     assert outputs["overlay"].encoding == "rgb8"
     assert outputs["reconstruction"].height == frame.height
     assert {m.ns for m in outputs["markers"].markers} >= {"surfaces", "boxes", "normals", "labels"}
+
+
+def test_shapes_and_noise_arrive_with_the_regions_and_in_diagnostics(live, peer, frame):
+    stamp = next(stamps)
+    peer.send(frame, stamp)
+    array = peer.wait_for("regions", stamp)
+    expected = segment(frame, SegmenterConfig())
+    kinds = [{0: "none", 1: "plane", 2: "sphere", 3: "cylinder"}[s.primitive.kind] for s in array.surfaces]
+    assert kinds == [s.primitive.kind for s in expected.surfaces] and "plane" in kinds
+    for told, surface in zip(array.surfaces, expected.surfaces, strict=True):
+        values = [np.ravel(v) for v in surface.primitive.parameters.values()]
+        np.testing.assert_array_equal(told.primitive.parameters, np.concatenate(values) if values else [])
+    assert [r.persistence for r in array.regions] == [r.persistence for r in expected.regions]
+    assert array.noise.source == "estimated"
+    live.wait_until(lambda: "noise.source" in peer.diagnostics(), 5, peer.diagnostics)
+    values = peer.diagnostics()
+    assert values["noise.source"] == "estimated"
+    assert float(values["noise.range_sigma_mm"]) == pytest.approx(1e3 * array.noise.sigma, abs=0.006)
+    assert float(values["noise.at_median_depth_m"]) == pytest.approx(array.noise.depth, abs=0.006)
+    assert len(values["noise.color_sigma"].split()) == 3
+    assert float(values["noise.range_correlation_px"]) >= 1
 
 
 def test_depth_and_image(live, run, labels, frame):
