@@ -94,6 +94,9 @@ class RangeColorFrame:
             raise InputError(f"the image is {_size(points)}: at least 3x3 pixels are needed")
         if self.camera is not None and not isinstance(self.camera, PinholeCamera):
             raise InputError(f"camera: expected a PinholeCamera or None, got {type(self.camera).__name__}")
+        # One layout for the compiled kernels, which would be compiled again for each other one.
+        object.__setattr__(self, "points", np.require(points, requirements=["C", "W"]))
+        object.__setattr__(self, "color", np.require(color, requirements=["C", "W"]))
         if not self.valid.any():
             raise InputError("no valid pixel: every point is NaN or has z = 0")
 

@@ -302,6 +302,16 @@ def bench(
     run_bench(options, load_config(config, set_ or (), preset), output, force)
 
 
+@app.command(
+    epilog="Example: `rcseg warmup` after an installation or an update, or while a container is built"
+)
+def warmup() -> None:
+    """Compile all kernels now, and keep them: what starts later is ready within two seconds."""
+    from rcseg_ros.terminal import run_warmup
+
+    run_warmup()
+
+
 @app.command(epilog="Example: `rcseg inspect demo --frame 0`")
 def inspect(
     result: Annotated[Path, typer.Argument(help="Folder that `rcseg replay` wrote.", show_default=False)],

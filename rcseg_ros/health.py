@@ -52,6 +52,12 @@ class Health:
         self._measured: dict[str, str] = {}
         self._heard_at = time.monotonic()
         self._reported: tuple[int, int] = (0, 0)
+        self._progress = ""
+
+    def progress(self, text: str) -> None:
+        """What the node is doing at length, which the status then says; empty when it is done."""
+        with self._lock:
+            self._progress = text.strip()
 
     def count(self, name: str, by: int = 1) -> None:
         """Count an event, for example a message in or a frame dropped."""
@@ -113,6 +119,8 @@ class Health:
         """Warn of rejections since the last report and of silence; drops are how a live node keeps up."""
         rejected = sum(self._rejected.values())
         before, self._reported = self._reported, (rejected, self._counts["segmented"])
+        if self._progress:
+            return OK, self._progress
         if state != "active":
             return OK, state
         if rejected > before[0]:

@@ -60,6 +60,7 @@ class SegmentationNode(LifecycleNode):
         self._publishing = threading.Lock()  # held while the worker publishes and while publishers go
         self._active = False
         self._configured: list[Any] = []  # what on_configure made, undone in reverse order
+        self._inputs: Any = None
         answer_impossible_transitions(self)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         # Diagnostics go on while simulated time stands still.
@@ -129,13 +130,26 @@ class SegmentationNode(LifecycleNode):
         if parameters["input.use_tf"]:
             self._transforms = TransformListener(self)
             self._configured.append(self._transforms.destroy)
-        self.get_logger().info(f"configured in {warm_up(parameters.config, self.get_logger().info):.1f} s")
+        self.get_logger().info(f"configured in {self._compile():.1f} s")
         self._results = ResultPublishers(self)
         self._configured.append(self._destroy_results)
         self._worker = Worker(self._process, "segment")
         self._configured.append(lambda: self._worker.stop(STOP_TIMEOUT_S))
         self._inputs = Inputs(self, parameters, self.health, self._enqueue, self.reject)
         self._configured.append(self._inputs.destroy)
+
+    def _compile(self) -> float:
+        """Ready the kernels; seconds. That holds up the executor, so its progress is reported from here."""
+
+        def announce(text: str) -> None:
+            self.get_logger().info(text)
+            self.health.progress(text)
+            self._report()
+
+        try:
+            return warm_up(self.parameters.config, announce)
+        finally:
+            self.health.progress("")
 
     def _tear_down(self) -> None:
         while self._configured:
@@ -200,7 +214,7 @@ class SegmentationNode(LifecycleNode):
     def _report(self) -> None:
         if not rclpy.ok():
             return
-        drops = self._inputs.drops if self._configured else {}
+        drops = self._inputs.drops if self._configured and self._inputs is not None else {}
         status = self.health.status(f"{self.get_name()}: segmentation", self._state(), drops, make_rcl)
         stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(

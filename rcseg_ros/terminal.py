@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from statistics import median
+from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
@@ -24,12 +25,13 @@ from rcseg_ros.settings import bounds
 from rcseg_ros.staging import StagedFolder
 from rcseg_ros.view import Viewer, ViewRequest, view
 from rcseg_ros.viewers import FoxgloveViewer, PageViewer
-from rcseg_ros.warmup import warm_up
+from rcseg_ros.warmup import compiled, fill_cache, warm_up
 
 if TYPE_CHECKING:
     from rcseg_ros.evaluate import Report
 
 INTERRUPTED = 130  # exit code after Ctrl-C
+LOG_EVERY_S = 5.0  # progress where there is no terminal
 CONSOLE = Console(highlight=False)
 _PROGRESS = Console(stderr=True)
 
@@ -37,6 +39,32 @@ _PROGRESS = Console(stderr=True)
 def prepare(config: SegmenterConfig) -> None:
     """Compile or load the kernels; tell when it takes long."""
     warm_up(config, lambda text: CONSOLE.print(text))
+
+
+def run_warmup() -> None:
+    """Fill the cache of compiled kernels; tell how far it is, how long it took and where it lies."""
+    start = told = perf_counter()
+    with _PROGRESS.status("compiling", spinner="line") as status:
+
+        def on_case(name: str, done: int, total: int) -> None:
+            nonlocal told
+            number, now = len(compiled()), perf_counter()
+            text = f"{done} of {total} cases, {now - start:.0f} s, {number} kernels compiled; next: {name}"
+            status.update(text)
+            if not _PROGRESS.is_terminal and now - told > LOG_EVERY_S:
+                _PROGRESS.print(text, soft_wrap=True)
+                told = now
+
+        try:
+            kept = fill_cache(on_case)
+        except KeyboardInterrupt:
+            CONSOLE.print(f"{len(compiled())} kernels compiled and kept; the next run goes on from there")
+            raise
+    number, seconds = len(compiled()), perf_counter() - start
+    what = f"{_count(number, 'kernel')} compiled" if number else "nothing to compile, all was there"
+    CONSOLE.print(f"{what}, in {seconds:.1f} s")
+    CONSOLE.print(f"{kept.megabytes:.1f} MB kept in {kept.folder}", soft_wrap=True)
+    CONSOLE.print("They stay until rcseg, Numba or Python is updated, or the processor is another.")
 
 
 def run_replay(request: ReplayRequest) -> int:

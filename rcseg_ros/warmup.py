@@ -1,20 +1,59 @@
-"""The first compile of the kernels: once for a machine, up to a minute, announced and never silent.
+"""The compiled kernels: once for a machine and a version, up to a minute or two, announced and never silent.
 
 Numba keeps the compiled code beside the package, or in the user's cache folder where the package cannot be
-written (NUMBA_CACHE_DIR names another place).
+written (NUMBA_CACHE_DIR names another place). `warm_up` readies one configuration, at the start of a command
+or of the node; `fill_cache` readies all that a configuration can call, which is `rcseg warmup`.
 """
 
 from __future__ import annotations
 
+import os
+import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 
-from rcseg_core import PinholeCamera, RangeColorFrame, SegmenterConfig, segment
+from rcseg_core import PinholeCamera, RangeColorFrame, Segmentation, SegmenterConfig, segment
+from rcseg_core.config import PRESETS
+from rcseg_core.errors import InputError
+from rcseg_core.extents import region_extents
+from rcseg_core.jit import cache_folder
 
 _PATIENCE_S, _BEAT_S = 3.0, 10.0
+#: Configurations that reach kernels which no preset calls, by what they are for.
+_OTHERS: dict[str, dict[str, Any]] = {
+    "surfaces_first": {"grouping.order": "surfaces_first"},
+    "joint": {"grouping.order": "joint"},
+    "range_only": {"grouping.order": "range_only"},
+    "chow": {"grouping.criterion": "chow", "grouping.edge_gate": False},
+    "bayes": {"grouping.criterion": "bayes"},
+    "lms": {"seeds.fit": "lms"},
+    "region": {"generalization.hypothesis": "region", "generalization.test": "f"},
+    "sensor": {"noise.range_model": "kinect_v1", "noise.color_sigma": 2.0},
+    "constant": {"noise.range_model": "constant"},
+    "active": {"reflectance.mode": "active"},
+    "no absorption": {"absorption.enabled": False},
+    "no outliers": {"edges.outlier_threshold": 0.0},
+}
+
+
+@dataclass(frozen=True)
+class Cache:
+    """What is kept, and where.
+
+    folder : where the kernels lie
+    lasting : False where nothing could be written but a temporary folder
+    megabytes : of all that lies there for these sources
+    """
+
+    folder: Path
+    lasting: bool
+    megabytes: float
 
 
 def warm_up(config: SegmenterConfig, announce: Callable[[str], None]) -> float:
@@ -30,17 +69,111 @@ def warm_up(config: SegmenterConfig, announce: Callable[[str], None]) -> float:
             return
         announce("Compiling the kernels for this machine: about a minute, only the first time ...")
         while not done.wait(_BEAT_S):
-            announce(f"  still compiling, {perf_counter() - start:.0f} s")
+            announce(f"  still compiling, {perf_counter() - start:.0f} s, {len(compiled())} kernels so far")
         announce(f"  compiled in {perf_counter() - start:.0f} s; kept for the next start")
 
     reporter = threading.Thread(target=report, daemon=True)
     reporter.start()
     try:
-        _ = segment(_small_scene(), config).surfaces
+        _use(_small_scene(), config)
     finally:
         done.set()
         reporter.join()
     return perf_counter() - start
+
+
+def fill_cache(on_case: Callable[[str, int, int], object] = lambda name, done, total: None) -> Cache:
+    """Compile all kernels and keep them.
+
+    Parameters
+    ----------
+    on_case : called with what comes next, how many cases are done, and how many there are
+
+    Raises
+    ------
+    InputError
+        If there is no place to keep them.
+    """
+    cases = list(_cases())
+    for done, (name, frame, config) in enumerate(cases):
+        on_case(name, done, len(cases))
+        _use(frame(), config)
+    on_case("", len(cases), len(cases))
+    kept = cache()
+    if not kept.lasting:
+        raise InputError(
+            f"the kernels are compiled, but neither the package nor ~/.cache can be written to keep them "
+            f"(they lie in {kept.folder} until a restart): set NUMBA_CACHE_DIR to a folder that can"
+        )
+    return kept
+
+
+def cache() -> Cache:
+    """Where the compiled kernels of these sources are kept."""
+    folders = {Path(cache_folder(module)) for module in _modules()}
+    lasting = not any(folder.name.startswith("rcseg-kernels-") for folder in folders)
+    size = sum(file.stat().st_size for folder in folders for file in folder.rglob("*") if file.is_file())
+    return Cache(Path(os.path.commonpath([folder.parent for folder in folders])), lasting, size / 1e6)
+
+
+def compiled() -> list[str]:
+    """Names of the kernels that this process compiled itself, because the cache did not hold them."""
+    return [
+        f"{kernel.__module__}.{kernel.__name__}"
+        for kernel in _kernels()
+        for _ in range(sum(kernel.stats.cache_misses.values()))
+    ]
+
+
+def _kernels() -> list[Any]:
+    """All kernels of the modules that are loaded, each once."""
+    found = {}
+    for module in _modules():
+        for value in list(vars(sys.modules[f"rcseg_core.{module}"]).values()):
+            if hasattr(value, "signatures") and hasattr(value, "stats"):
+                found[id(value)] = value
+    return list(found.values())
+
+
+def _modules() -> list[str]:
+    """Loaded modules of the core that use kernels."""
+    names = [name.removeprefix("rcseg_core.") for name in list(sys.modules) if name.startswith("rcseg_core.")]
+    return [name for name in names if {"kernel", "bare"} & vars(sys.modules[f"rcseg_core.{name}"]).keys()]
+
+
+def _cases() -> Iterator[tuple[str, Callable[[], RangeColorFrame], SegmenterConfig]]:
+    """Name, frame and configuration of what must have been run once."""
+    from rcseg_core.synthetic import make_scene
+
+    default = SegmenterConfig()
+    for name in PRESETS:
+        yield f"preset {name}", _small_scene, SegmenterConfig.preset(name)
+    for name, changes in _OTHERS.items():
+        yield name, _small_scene, default.replace(changes)
+    yield "the paper's own form", _small_scene, SegmenterConfig.literal()
+    for order in ("surfaces_first", "joint", "range_only"):
+        config = default.replace({"grouping.order": order})
+        yield f"without a camera, {order}", lambda: replace(_small_scene(), camera=None), config
+        yield f"points of 64 bits, {order}", _precise, config
+    for family in ("room", "curved", "painting"):
+        scene = make_scene(family, 0, width=320, height=240, outliers=0.02, dropout=0.05).frame
+        for preset in PRESETS:
+            yield f"{family}, preset {preset}", lambda scene=scene: scene, SegmenterConfig.preset(preset)
+
+
+def _use(frame: RangeColorFrame, config: SegmenterConfig) -> Segmentation:
+    """Everything that commands and the node ask of a frame."""
+    result = segment(frame, config)
+    surface, _ = result.reconstruct()
+    region_extents(frame.color, result.labels, result.regions, surface)
+    result.labels_at(0.5)
+    result.labels_at(2.0)
+    return result
+
+
+def _precise() -> RangeColorFrame:
+    frame = _small_scene()
+    return RangeColorFrame(frame.points.astype(np.float64), frame.color, frame.camera)
 
 
 def _small_scene() -> RangeColorFrame:

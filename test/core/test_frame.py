@@ -115,3 +115,15 @@ def test_from_depth_puts_points_on_the_rays_of_the_camera():
     for row, col in ((0, 0), (47, 63), (20, 31)):
         projected = CAMERA.matrix() @ frame.points[row, col]
         np.testing.assert_allclose(projected[:2] / projected[2], [col, row], atol=1e-3)
+
+
+def test_every_layout_comes_to_the_kernels_as_one():
+    """Numba compiles a kernel for each layout; what fits already is taken as it is."""
+    points, color = np.ones((6, 8, 3), np.float32), np.zeros((6, 8, 3), np.uint8)
+    frame = RangeColorFrame(points, color)
+    assert frame.points is points and frame.color is color
+    color.setflags(write=False)
+    odd = RangeColorFrame(points[::2, ::-1], color[::2, ::-1])
+    for array in (odd.points, odd.color):
+        assert array.flags.c_contiguous and array.flags.writeable
+    np.testing.assert_array_equal(odd.color, color[::2, ::-1])

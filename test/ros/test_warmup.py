@@ -1,9 +1,19 @@
-"""A long compile is announced while it lasts; a warm start says nothing."""
+"""A long compile is announced while it lasts, a warm start says nothing; after `rcseg warmup` nothing is left
+to compile, and it says where the kernels lie."""
 
+import subprocess
+import sys
 import time
+from pathlib import Path
+from types import SimpleNamespace
 
 from rcseg_core import SegmenterConfig
+from rcseg_core.config import describe
 from rcseg_ros import warmup
+from rcseg_ros.cli import main
+from rcseg_ros.health import Health
+
+BAGS = Path(__file__).resolve().parents[2] / "bags"
 
 
 def run(monkeypatch, seconds):
@@ -13,7 +23,7 @@ def run(monkeypatch, seconds):
         frames.append(frame)
         time.sleep(seconds)
 
-    monkeypatch.setattr(warmup, "segment", slow)
+    monkeypatch.setattr(warmup, "_use", slow)
     monkeypatch.setattr(warmup, "_PATIENCE_S", 0.1)
     monkeypatch.setattr(warmup, "_BEAT_S", 0.1)
     took = warmup.warm_up(SegmenterConfig(), said.append)
@@ -30,3 +40,108 @@ def test_a_long_compile_is_announced_and_goes_on_being_told(monkeypatch):
 
 def test_a_warm_start_is_silent(monkeypatch):
     assert run(monkeypatch, 0.0) == []
+
+
+def test_every_choice_of_every_parameter_is_among_the_cases():
+    """A kernel may hang on any switch; those that need a second frame (calibrated) have none."""
+    used = {(p.key, p.value) for _, _, config in warmup._cases() for p in describe(config) if p.choices}
+    wanted = {(p.key, choice) for p in describe(SegmenterConfig()) for choice in p.choices}
+    alike = {
+        ("reflectance.mode", "calibrated"),  # numpy alone
+        ("noise.range_model", "realsense_d435"),  # another table of the same law
+        ("signal.kind", "inverse_depth"),  # what auto chooses with a camera
+    }
+    assert wanted - used == alike
+
+
+def test_after_it_nothing_is_left_to_compile(tmp_path):
+    """In a process of its own: recorded depth, colour and clouds, and a scene that the cases do not hold."""
+    program = f"""
+import sys
+sys.path.insert(0, {str(Path(__file__).parent)!r})
+from pathlib import Path
+import recordings
+from rcseg_core import RangeColorFrame, SegmenterConfig, segment
+from rcseg_core.synthetic import make_scene
+from rcseg_ros.replay import ReplayRequest, replay
+from rcseg_ros.warmup import compiled, fill_cache
+fill_cache()
+before = len(compiled())
+folder = Path({str(tmp_path)!r})
+recordings.write_folder(folder / "depth", recordings.depth_entries(1))
+recordings.write_folder(folder / "cloud", recordings.cloud_entries(1))
+bags = folder / "depth", folder / "cloud", Path({str(BAGS / "tabletop")!r})
+for i, bag in enumerate(bags):
+    replay(ReplayRequest(bag, folder / str(i), SegmenterConfig(), max_frames=1))
+frame = make_scene("blocks", 5, width=320, height=240).frame
+frame.color.setflags(write=False)
+segment(RangeColorFrame(frame.points[:, ::2], frame.color[:, ::2])).regions
+late = compiled()[before:]
+assert not late, late
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_command_tells_time_and_place(capsys, monkeypatch):
+    seen = []
+    monkeypatch.setattr(warmup, "_use", lambda frame, config: seen.append(config))
+    assert main(["warmup"]) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert len(seen) > 15 and " MB kept in " in text
+    place = Path(text.partition(" MB kept in ")[2].split()[0])
+    assert any(place.glob("kernels-grouping-*")), place
+
+
+def test_kernels_that_cannot_be_kept_are_an_error(capsys, monkeypatch, tmp_path):
+    lost = tmp_path / "rcseg-kernels-abc"
+    lost.mkdir()
+    monkeypatch.setattr(warmup, "cache_folder", lambda module: str(lost))
+    monkeypatch.setattr(warmup, "_use", lambda frame, config: None)
+    assert main(["warmup"]) == 2
+    error = capsys.readouterr().err
+    assert "NUMBA_CACHE_DIR" in error and str(tmp_path) in error and error.count("\n") == 1
+
+
+def test_an_interrupt_keeps_what_was_compiled(capsys, monkeypatch):
+    def interrupted(frame, config):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(warmup, "_use", interrupted)
+    assert main(["warmup"]) == 130
+    assert "goes on from there" in capsys.readouterr().out
+
+
+def test_diagnostics_tell_of_the_compile_while_it_lasts():
+    health = Health()
+
+    def message(state):
+        return health.status("node", state, {}, lambda kind, **fields: SimpleNamespace(**fields)).message
+
+    assert message("configuring") == "configuring"
+    health.progress("  still compiling, 20 s")
+    assert message("configuring") == "still compiling, 20 s"
+    health.progress("")
+    assert message("inactive") == "inactive"
+
+
+def test_the_node_reports_each_step_of_its_compile(live, monkeypatch):
+    from rcseg_ros import node as node_module
+
+    said, reported = [], []
+
+    def compile_slowly(config, announce):
+        announce("Compiling ...")
+        announce("  still compiling, 10 s")
+        return 12.0
+
+    monkeypatch.setattr(node_module, "warm_up", compile_slowly)
+    node = SimpleNamespace(
+        health=Health(),
+        parameters=SimpleNamespace(config=SegmenterConfig()),
+        get_logger=lambda: SimpleNamespace(info=said.append),
+        _report=lambda: reported.append(node.health._progress),
+    )
+    assert node_module.SegmentationNode._compile(node) == 12.0
+    assert said == ["Compiling ...", "  still compiling, 10 s"]
+    assert reported == ["Compiling ...", "still compiling, 10 s"] and node.health._progress == ""
