@@ -72,8 +72,11 @@ def replay(
     overlays: Annotated[bool, typer.Option("--overlays", help="Write a PNG of each frame too.")] = False,
     force: Force = False,
     workers: Annotated[
-        int, typer.Option(min=0, max=64, help="Frames segmented at once; 0: as many as there are processors.")
-    ] = 0,
+        Optional[int],  # noqa: UP045
+        typer.Option(
+            min=1, max=64, help="Frames that are segmented at once; by default as many as processors."
+        ),
+    ] = None,
     max_frames: Annotated[Optional[int], typer.Option(min=1, help="Stop after so many.")] = None,  # noqa: UP045
 ) -> None:
     """Segment a recording: a result bag, metrics.json, config.yaml and a table."""
@@ -91,7 +94,7 @@ def replay(
         outputs=_parse_outputs(outputs),
         overlays=overlays,
         force=force,
-        workers=workers,
+        workers=workers or 0,
         max_frames=max_frames,
     )
     raise typer.Exit(run_replay(request))
