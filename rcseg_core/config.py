@@ -67,6 +67,12 @@ class SignalConfig:
         choices=("auto", "inverse_depth", "xyz"),
         symbol="eta_r",
     )
+    reduction: int = _param(
+        1,
+        "side of the squares of pixels that are averaged first; labels come back at full size. "
+        "1: none; 2 takes a third of the time and misses what is only a few pixels wide",
+        unit="px", low=1, high=4,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from rcseg_core.edges import RANGE_EDGES, detect_edges
 from rcseg_core.errors import ConfigError
 from rcseg_core.frame import RangeColorFrame
 from rcseg_core.partition import Partition
+from rcseg_core.reduction import LEAST_SIDE_PX, at_full_size, reduced, unreduced
 from rcseg_core.reflectance import normalize_reflectance
 from rcseg_core.seeds import initial_partition
 from rcseg_core.segmentation import Segmentation
@@ -66,6 +67,9 @@ def segment(
 
     # 1. normalise the colour (section 3) and find the discontinuities (section 8)
     color = normalize_reflectance(frame, config.reflectance, white_reference)
+    if config.signal.reduction > 1 and min(frame.valid.shape) >= LEAST_SIDE_PX:  # coarse to fine
+        small = segment(reduced(frame, color, config.signal.reduction), unreduced(config))
+        return at_full_size(frame, color, small, config)
     signals = build_signals(frame, color, config)
     clock.lap("signals")
     edges = detect_edges(signals, config.edges)
@@ -159,8 +163,7 @@ def conclude(
         edges=edges,
         timings=clock.seconds,
         camera=frame.camera,
-        signals=signals,
-        models=models,
+        measure=lambda: (signals, models),
         leaves=partition.leaves,
         range_leaves=surfaces.leaves if surfaces is not None else None,
         nodes=partition.nodes,

@@ -102,8 +102,7 @@ class Segmentation:
     edges: NDArray[np.uint8]
     timings: dict[str, float]
     camera: PinholeCamera | None
-    signals: Signals = field(repr=False)
-    models: Models = field(repr=False)
+    measure: Callable[[], tuple[Signals, Models]] = field(repr=False)
     tree: Hierarchy = field(repr=False)
     range_tree: Hierarchy | None = field(repr=False)
     leaves: NDArray[np.int32] = field(repr=False)
@@ -111,6 +110,20 @@ class Segmentation:
     nodes: NDArray[np.int64] = field(repr=False)
     coarsen: Callable[[], Grouped] = field(repr=False)
     describe: Callable[[], Sequence[Region]] = field(repr=False)
+
+    @cached_property
+    def _measured(self) -> tuple[Signals, Models]:
+        return self.measure()
+
+    @property
+    def signals(self) -> Signals:
+        """The whitened signals of the frame."""
+        return self._measured[0]
+
+    @property
+    def models(self) -> Models:
+        """The whitened model of each region."""
+        return self._measured[1]
 
     @property
     def noise(self) -> NoiseModel:

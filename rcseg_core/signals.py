@@ -144,7 +144,7 @@ def build_signals(frame: RangeColorFrame, color: NDArray[np.uint8], config: Segm
     """
     valid = frame.valid
     inverse = uses_inverse_depth(frame, config)
-    raw = _range_signal(frame, inverse)
+    raw = range_signal(frame, inverse)
     median_r, median_c = np.empty_like(raw), np.empty(color.shape, np.uint8)
     together(lambda: local_median(raw, valid, median_r), lambda: color_median(color, median_c))
     noise = estimate_noise(raw, median_r, valid, color, median_c, inverse, config.noise)
@@ -281,12 +281,43 @@ def whiten(  # type: ignore[no-untyped-def]
             flags[row, col] = flag
 
 
-def _range_signal(frame: RangeColorFrame, inverse: bool) -> NDArray[np.float32]:
+def range_signal(frame: RangeColorFrame, inverse: bool) -> NDArray[np.float32]:
     if not inverse:
         return np.where(frame.valid[..., None], frame.points, 0).astype(np.float32)
     out = np.empty((*frame.valid.shape, 1), np.float32)
     over_bands(frame.height, lambda _, a, b: _invert(frame.depth_m, frame.valid, a, b, out))
     return out
+
+
+def measured_again(
+    signals: Signals, frame: RangeColorFrame, color: NDArray[np.uint8], noise_factor: float
+) -> Signals:
+    """Another image of the same scene, whitened like `signals` with noise that is larger by a factor.
+
+    No impulses are looked for, and `cleaned` is the image itself.
+    """
+    n = signals.n_range
+    raw = range_signal(frame, signals.inverse_depth)
+    scale = signals.scale * noise_factor
+    law = signals.law.copy()
+    law[:3] *= noise_factor ** np.arange(3)  # of a value in other units; sigma itself grows as they do
+    law[3] /= noise_factor
+    image = np.empty((*frame.valid.shape, n + 3), np.float32)
+    cleaned, cleaned_color = np.empty_like(raw), np.empty(color.shape, np.uint8)
+    flags = np.empty(frame.valid.shape, np.uint8)
+    levels = ((np.arange(256.0) - signals.offset[n:, None]) / scale[n:, None]).astype(np.float32)
+    over_bands(
+        frame.height,
+        lambda _, first, last: whiten(
+            raw, raw, color, color, frame.valid, scale, signals.offset, levels, law, 0.0, first, last, image,
+            cleaned, cleaned_color, flags,
+        ),
+    )  # fmt: skip
+    return replace(
+        signals, image=image, cleaned=cleaned, cleaned_color=cleaned_color, flags=flags, scale=scale, law=law,
+        color_eps2=signals.color_eps2 / noise_factor**2,
+        slope=(signals.slope[0] / noise_factor, signals.slope[1]),
+    )  # fmt: skip
 
 
 @bare

@@ -1,0 +1,207 @@
+"""Coarse to fine: segment the means of small squares of pixels, then let the borders follow the full image.
+
+A square of r x r pixels has the noise of its mean, so that the same surfaces are told apart with 1 / r^2 of
+the pixels. Where a square lies across a depth edge only its larger side is averaged. Labels come back at full
+size, where border pixels choose between the models of the regions that meet; the models, patches and coarser
+levels of the full image are computed when they are asked for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import cache, partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rcseg_core.absorption import refine
+from rcseg_core.config import SegmenterConfig
+from rcseg_core.description import describe_regions
+from rcseg_core.frame import PinholeCamera, RangeColorFrame
+from rcseg_core.grouping import Grouped
+from rcseg_core.jit import bare
+from rcseg_core.models import Models
+from rcseg_core.parallel import over_bands
+from rcseg_core.partition import Partition, count_pixels, relabel
+from rcseg_core.segmentation import Region, Segmentation
+from rcseg_core.signals import Signals, build_signals, measured_again
+from rcseg_core.stages import final_models
+
+#: A smaller image is segmented as it is.
+LEAST_SIDE_PX = 32
+#: Points of one square belong together when their depths differ by less than this share of depth.
+SAME_SIDE = 0.02
+
+
+@bare
+def _average(points, valid, color, step, inverse, first, last, out_points, out_color):  # type: ignore[no-untyped-def]
+    """Means of squares of `step` pixels, rows first..last-1 of the output; NaN where no pixel is valid.
+
+    inverse : the mean depth is that of the inverse depths, and x, y are left as NaN
+    """
+    height, width = valid.shape
+    for i in range(first, last):
+        for j in range(out_points.shape[1]):
+            row1 = min((i + 1) * step, height)
+            col1 = min((j + 1) * step, width)
+            # the pixel with most company in depth stands for its side of the square
+            best = -1
+            center = np.nan
+            for row in range(i * step, row1):
+                for col in range(j * step, col1):
+                    if not valid[row, col]:
+                        continue
+                    z = np.float64(points[row, col, 2])
+                    company = 0
+                    for r in range(i * step, row1):
+                        for c in range(j * step, col1):
+                            if valid[r, c] and abs(points[r, c, 2] - z) <= SAME_SIDE * abs(z):
+                                company += 1
+                    if company > best:
+                        best = company
+                        center = z
+            x = y = z = red = green = blue = n = 0.0
+            for row in range(i * step, row1):
+                for col in range(j * step, col1):
+                    if best > 0:
+                        if not valid[row, col] or abs(points[row, col, 2] - center) > SAME_SIDE * abs(center):
+                            continue
+                        x += points[row, col, 0]
+                        y += points[row, col, 1]
+                        z += 1.0 / points[row, col, 2] if inverse else points[row, col, 2]
+                    red += color[row, col, 0]
+                    green += color[row, col, 1]
+                    blue += color[row, col, 2]
+                    n += 1.0
+            out_color[i, j, 0] = np.uint8(red / n + 0.5)
+            out_color[i, j, 1] = np.uint8(green / n + 0.5)
+            out_color[i, j, 2] = np.uint8(blue / n + 0.5)
+            if best > 0:
+                out_points[i, j, 0] = x / n
+                out_points[i, j, 1] = y / n
+                out_points[i, j, 2] = n / z if inverse else z / n
+            else:
+                for k in range(3):
+                    out_points[i, j, k] = np.nan
+
+
+@cache
+def _rays(camera: PinholeCamera, height: int, width: int) -> NDArray[np.float32]:
+    return camera.rays(height, width)
+
+
+def unreduced(config: SegmenterConfig) -> SegmenterConfig:
+    """What the small image is segmented with: its colour is normalised already."""
+    return config.replace({"signal.reduction": 1, "reflectance.mode": "none"})
+
+
+def reduced(frame: RangeColorFrame, color: NDArray[np.uint8], step: int) -> RangeColorFrame:
+    """The frame of the means of squares of `step` pixels; the last ones of a row or column may be cut off.
+
+    color : (H, W, 3) uint8, the frame's colour after the reflectance stage
+    """
+    height, width = -(-frame.height // step), -(-frame.width // step)
+    points, means = np.empty((height, width, 3), np.float32), np.empty((height, width, 3), np.uint8)
+    old = frame.camera
+    over_bands(
+        height,
+        lambda _, a, b: _average(
+            frame.points, frame.valid, color, step, old is not None, a, b, points, means
+        ),
+    )
+    if old is None:
+        return RangeColorFrame(points, means, None)
+    half = (step - 1) / 2.0
+    camera = PinholeCamera(old.fx / step, old.fy / step, (old.cx - half) / step, (old.cy - half) / step)
+    points = _rays(camera, height, width) * points[..., 2:]
+    return RangeColorFrame(points, means, camera)
+
+
+@bare
+def _repeat(image, mapping, flags, step, first, last, out):  # type: ignore[no-untyped-def]
+    """out[row, col] = mapping[image[row // step, col // step]], 0 on flagged pixels."""
+    for row in range(first, last):
+        for col in range(out.shape[1]):
+            out[row, col] = mapping[image[row // step, col // step]] if flags[row, col] == 0 else 0
+
+
+def _enlarged(image: NDArray[Any], flags: NDArray[np.uint8], step: int) -> NDArray[Any]:
+    """`image` with every pixel repeated; 0 where flagged."""
+    out = np.empty(flags.shape, image.dtype)
+    same = np.arange(int(image.max(initial=0)) + 1)
+    over_bands(len(out), lambda _, a, b: _repeat(image, same, flags, step, a, b, out))
+    return out
+
+
+def _full_models(models: Models, step: int, factor: float) -> Models:
+    """Models of the small image in the coordinates of the full one, whose unit is larger by a factor."""
+    low = models.coef.shape[-1]
+    powers = np.arange(low)
+    shrink = float(step) ** -(powers[:, None] + powers[None, :])
+    return models._replace(center=models.center * step + (step - 1) / 2.0, coef=models.coef * shrink / factor)
+
+
+def at_full_size(
+    frame: RangeColorFrame, color: NDArray[np.uint8], small: Segmentation, config: SegmenterConfig
+) -> Segmentation:
+    """The result of the reduced frame on all pixels of the frame itself.
+
+    Parameters
+    ----------
+    color : (H, W, 3) uint8, the frame's colour after the reflectance stage
+    small : Segmentation of ``reduced(frame, config.signal.reduction)``
+    """
+    step = config.signal.reduction
+    # a pixel has the noise of a mean times the root of the independent pixels in it
+    factor = max(step / float(np.sqrt(small.noise.range_correlation)), 1.0)
+    signals = measured_again(small.signals, frame, color, factor)
+    labels = _enlarged(small.labels, signals.flags, step)
+    leaves = _enlarged(small.leaves, signals.flags, step)
+    refine(signals, labels, leaves, _full_models(small.models, step, factor), config.absorption.refine_passes)
+
+    old_count = small.nodes.size - 1
+    sizes = count_pixels(labels, old_count)[1:]
+    order = np.argsort(-sizes, kind="stable") + 1  # regions that no pixel shows keep the last numbers
+    number = np.zeros(old_count + 1, np.int32)
+    number[order] = np.arange(1, old_count + 1)
+    relabel(labels, number)
+    count = int(np.count_nonzero(sizes))
+    surface_of = np.zeros(old_count + 1, np.int32)
+    surface_of[number[small.labels]] = small.surface_labels
+    surface_labels = labels.copy()
+    relabel(surface_labels, surface_of)
+    surfaces = surface_of.astype(np.int64)[: count + 1]
+    edges = _enlarged(small.edges, signals.flags, step)
+
+    @cache
+    def measured() -> tuple[Signals, Models, Callable[[], Sequence[Region]]]:
+        full, partition = build_signals(frame, color, config), Partition(labels, count)
+        moments, models = final_models(partition, full, config)
+        boxes, pairs = partition.boxes(), partition.pairs(edges, config.grouping.max_gap)
+        return full, models, partial(
+            describe_regions, frame, full, labels, surfaces, moments, models, boxes, pairs
+        )  # fmt: skip
+
+    return replace(
+        small,
+        labels=labels,
+        surface_labels=surface_labels,
+        edges=edges,
+        camera=frame.camera,
+        measure=lambda: measured()[:2],
+        leaves=leaves,
+        range_leaves=None
+        if small.range_leaves is None
+        else _enlarged(small.range_leaves, signals.flags, step),
+        nodes=small.nodes[np.concatenate([[0], order])],
+        coarsen=partial(_renumbered, small.coarsen, number),
+        describe=lambda: measured()[2](),
+    )
+
+
+def _renumbered(coarsen: Any, number: NDArray[np.int32]) -> Grouped:
+    """The groupings of the small result in the numbers of the full one."""
+    grouped: Grouped = coarsen()
+    return grouped._replace(merges=number[grouped.merges].astype(np.int64))
