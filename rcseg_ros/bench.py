@@ -11,7 +11,7 @@ import os
 import platform
 import tempfile
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import perf_counter
@@ -21,11 +21,12 @@ import cv2
 import numba
 import numpy as np
 
-from rcseg_core import RangeColorFrame, SegmenterConfig, segment
+from rcseg_core import RangeColorFrame, SegmenterConfig, parallel, segment
 from rcseg_core.datasets import find_frames, load_frame
 from rcseg_core.errors import InputError
 from rcseg_core.synthetic import make_scene
 from rcseg_ros.bench_peers import Peer, installed_peers
+from rcseg_ros.bench_presets import PresetRow, compare_presets, judged_scenes
 from rcseg_ros.bench_probe import fresh_process
 
 SYNTHETIC, RECORDED = "synthetic", "recorded"
@@ -33,7 +34,8 @@ SEGMENT, FRAME, REGIONS = "segment()", "frame", "regions"
 """What is timed beside the stages: segment() alone; with the regions described; that description."""
 SLOW_S = 1.0
 """A peer that takes longer than this runs once for each frame and not in every round."""
-ALL = os.cpu_count() or 1
+ALL = parallel.cores()
+VGA_PIXELS = 640 * 480
 
 
 @dataclass(frozen=True)
@@ -50,6 +52,7 @@ class BenchOptions:
     peers : run other segmenters too
     probe : measure memory and the first labels in fresh processes, one for each group
     cold : probe with an empty cache of compiled kernels too, once
+    presets : configurations to compare, by name; synthetic scenes of the size nearest to 640x480
     """
 
     sources: tuple[str, ...] = (SYNTHETIC,)
@@ -62,6 +65,7 @@ class BenchOptions:
     peers: bool = True
     probe: bool = True
     cold: bool = False
+    presets: Mapping[str, SegmenterConfig] = field(default_factory=dict)
 
 
 @dataclass
@@ -125,6 +129,7 @@ class BenchReport:
     cold: dict[str, float] = field(default_factory=dict)
     differing: list[str] = field(default_factory=list)
     """Frames whose labels depend on the number of threads."""
+    presets: list[PresetRow] = field(default_factory=list)
 
     def growth(self, threads: int) -> dict[str, float]:
         """By family: time over pixels, largest size against 320x240; 1 grows as the pixels do."""
@@ -153,6 +158,7 @@ class BenchReport:
             "cold_cache": self.cold,
             "growth": {str(n): self.growth(n) for n in self.options.threads},
             "labels_differ_by_threads": self.differing,
+            "presets": [row.row() for row in self.presets],
         }
 
 
@@ -211,6 +217,11 @@ def run_bench(
             if options.cold and not report.cold:
                 on_step("compiling everything in an empty cache: a minute or two")
                 report.cold = _probe(frame, config, cold=True)
+        if options.presets:
+            set_threads(max(options.threads))
+            peer = peers[0] if peers else None
+            frames = _preset_frames(options)
+            report.presets = compare_presets(options.presets, frames, options.repeat, peer, on_step)
     finally:
         set_threads(ALL)
     return report
@@ -218,7 +229,7 @@ def run_bench(
 
 def set_threads(number: int) -> None:
     """Let the kernels and OpenCV use so many threads."""
-    numba.set_num_threads(min(number, numba.config.NUMBA_NUM_THREADS))
+    parallel.set_threads(number)
     cv2.setNumThreads(number)
 
 
@@ -249,6 +260,17 @@ def _frames(options: BenchOptions) -> Iterator[tuple[str, str, RangeColorFrame]]
                 for seed in options.seeds:
                     scene = make_scene(family, seed, width=width, height=height)
                     yield family, f"{family}_{seed:03d}", scene.frame
+
+
+def _preset_frames(options: BenchOptions) -> Iterator[tuple[str, str, RangeColorFrame, Any]]:
+    """What presets are compared on: synthetic scenes of one size, recorded frames without a judge."""
+    size = min(options.sizes, key=lambda s: abs(s[0] * s[1] - VGA_PIXELS))
+    for source in options.sources:
+        if source == SYNTHETIC:
+            yield from judged_scenes(options.families, options.seeds, size)
+        else:
+            for name, path in find_frames(source, options.match):
+                yield RECORDED, name, load_frame(path, name=name).frame, None
 
 
 def _measure(

@@ -11,12 +11,12 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from rcseg_ros.bench import FRAME, REGIONS, SEGMENT, BenchReport, Group
+from rcseg_core.metrics import REPORT_TOLERANCE
+from rcseg_ros.bench import FRAME, REGIONS, SEGMENT, VGA_PIXELS, BenchReport, Group
 from rcseg_ros.reports import write_csv
 from rcseg_ros.segmenting import plain
 
 BENCH = "bench.json"
-VGA_PIXELS = 640 * 480
 TABLE_WIDTH = 150
 
 
@@ -24,7 +24,8 @@ def write_bench(report: BenchReport, folder: Path) -> None:
     """All figures as JSON, the rows as CSV too, a table for a document, and two plots."""
     (folder / BENCH).write_text(json.dumps(plain(report.document()), indent=1) + "\n", "utf-8")
     write_csv(folder / "bench.csv", [row for group in report.groups for row in group.rows()])
-    (folder / "bench.md").write_text(markdown(report), "utf-8")
+    tables = [markdown(report), presets_markdown(report)]
+    (folder / "bench.md").write_text("\n".join(filter(None, tables)), "utf-8")
     plot_stages(folder / "stages.png", near_vga(report.groups))
     plot_pixels(folder / "pixels.png", report.groups)
 
@@ -50,6 +51,8 @@ def print_bench(report: BenchReport, console: Console) -> None:
     )
     console.print(_wholes(report))
     console.print(_stages(near_vga(report.groups)))
+    if report.presets:
+        console.print(_presets(report))
     if any(group.probe for group in report.groups):
         console.print(_fresh(report))
     for threads in report.options.threads:
@@ -88,6 +91,43 @@ def markdown(report: BenchReport) -> str:
         )
         lines.append(cells)
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+def presets_markdown(report: BenchReport) -> str:
+    """The table of the presets, as docs/performance.md shows it; empty where none were compared."""
+    if not report.presets:
+        return ""
+    heads, rows = _preset_cells(report)
+    lines = [heads, ["---"] * 3 + ["---:"] * (len(heads) - 3), *rows]
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+def _preset_cells(report: BenchReport) -> tuple[list[str], list[list[str]]]:
+    """Heads and rows of the presets: time, the multiple of the first peer, accuracy."""
+    peer = next((peer for group in report.groups for peer in group.peers), "a peer")
+    tolerance = f"correct at {REPORT_TOLERANCE:.0%}"
+    heads = ["preset", "frames", "size", "n", "segment(), ms", f"of {peer}", tolerance, "noise regions"]
+    rows = []
+    for found in (row.row() for row in report.presets):
+        share = "" if found["correct"] is None else f"{found['correct']:.3f} of {found['truth_regions']}"
+        rows.append(
+            [
+                found["preset"], found["group"], f"{found['width']}x{found['height']}", str(found["frames"]),
+                f"{found['median_ms']:.1f} ({found['p95_ms']:.1f})",
+                "" if found["ratio"] is None else f"x{found['ratio']:.2f}",
+                share,
+                "" if found["noise_regions"] is None else str(found["noise_regions"]),
+            ]
+        )  # fmt: skip
+    return heads, rows
+
+
+def _presets(report: BenchReport) -> Table:
+    heads, rows = _preset_cells(report)
+    table = _table("Presets: median (p95), and accuracy of the regions", heads[:3], heads[3:])
+    for cells in rows:
+        table.add_row(*cells)
+    return table
 
 
 def _wholes(report: BenchReport) -> Table:

@@ -275,6 +275,10 @@ def bench(
     cold: Annotated[
         bool, typer.Option("--cold", help="First labels with an empty cache too: a minute or two.")
     ] = False,
+    presets: Annotated[
+        bool,
+        typer.Option("--presets", help="Compare the presets too: time, and accuracy on the seeds' scenes."),
+    ] = False,
     output: Annotated[
         Optional[Path],  # noqa: UP045
         typer.Option("--output", "-o", help="Folder for bench.json, bench.csv and plots; without it none."),
@@ -301,6 +305,7 @@ def bench(
         peers=peers,
         probe=probe or cold,
         cold=cold,
+        presets={one.value: load_config(config, set_ or (), one) for one in Preset} if presets else {},
     )
     run_bench(options, load_config(config, set_ or (), preset), output, force)
 

@@ -125,7 +125,8 @@ def run_bench(options: BenchOptions, config: SegmenterConfig, output: Path | Non
     """Measure, print tables and, with `output`, write files and plots there."""
     with ExitStack() as stack:
         stage = stack.enter_context(StagedFolder(output, force, BENCH)) if output is not None else None
-        prepare(config)
+        for each in (config, *options.presets.values()):
+            prepare(each)
         with _PROGRESS.status("measuring", spinner="line") as status:
             report = bench(options, config, status.update)
         print_bench(report, CONSOLE)

@@ -14,15 +14,16 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
-from rcseg_core import PinholeCamera, RangeColorFrame, Segmentation, SegmenterConfig, segment
+from rcseg_core import PinholeCamera, RangeColorFrame, SegmenterConfig, segment
 from rcseg_core.config import PRESETS
 from rcseg_core.errors import InputError
-from rcseg_core.extents import region_extents
 from rcseg_core.jit import cache_folder
+from rcseg_ros.messages import region_array
 
 _PATIENCE_S, _BEAT_S = 3.0, 10.0
 #: Configurations that reach kernels which no preset calls, by what they are for.
@@ -161,14 +162,12 @@ def _cases() -> Iterator[tuple[str, Callable[[], RangeColorFrame], SegmenterConf
             yield f"{family}, preset {preset}", lambda scene=scene: scene, SegmenterConfig.preset(preset)
 
 
-def _use(frame: RangeColorFrame, config: SegmenterConfig) -> Segmentation:
-    """Everything that commands and the node ask of a frame."""
+def _use(frame: RangeColorFrame, config: SegmenterConfig) -> None:
+    """Everything that commands and the node ask of a frame and that takes kernels."""
     result = segment(frame, config)
-    surface, _ = result.reconstruct()
-    region_extents(frame.color, result.labels, result.regions, surface)
+    region_array(frame, result, None, lambda type_name, /, **fields: SimpleNamespace(**fields))
     result.labels_at(0.5)
     result.labels_at(2.0)
-    return result
 
 
 def _precise() -> RangeColorFrame:

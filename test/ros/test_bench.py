@@ -7,9 +7,11 @@ import cv2
 import numpy as np
 import pytest
 
-from rcseg_core import SegmenterConfig
+from rcseg_core import SegmenterConfig, parallel, segment
 from rcseg_core.errors import InputError
+from rcseg_core.evaluation import evaluate_scene
 from rcseg_core.synthetic import make_scene
+from rcseg_ros import bench as bench_module
 from rcseg_ros import bench_report
 from rcseg_ros.bench import (
     FRAME,
@@ -155,3 +157,55 @@ def test_bad_input_is_one_line(tmp_path, capsys):
         assert main(["bench", *arguments]) == 2
         error = capsys.readouterr().err
         assert word in error and error.count("\n") == 1
+
+
+def test_presets_are_compared_on_time_and_accuracy(tmp_path, capsys):
+    where = tmp_path / "out"
+    given = (
+        "--families",
+        "room",
+        "--sizes",
+        "80x60,160x120",
+        "--seeds",
+        "3,4",
+        "--repeat",
+        "2",
+        "--no-probe",
+    )
+    assert (
+        main(
+            ["bench", *given, "--threads", "1", "--presets", "--set", "grouping.max_gap=2", "-o", str(where)]
+        )
+        == 0
+    )
+    shown = capsys.readouterr().out
+    rows = json.loads((where / "bench.json").read_text("utf-8"))["presets"]
+    assert [row["preset"] for row in rows] == ["fast", "balanced", "accurate"]
+    tables = (where / "bench.md").read_text("utf-8").split("\n\n")
+    assert len(tables) == 2 and tables[1].startswith("| preset | frames | size | n |")
+    for row in rows:
+        config = SegmenterConfig.preset(row["preset"]).replace({"grouping.max_gap": 2})
+        correct = truth = noise = 0
+        for seed in (3, 4):
+            scene = make_scene("room", seed, width=160, height=120)
+            found = evaluate_scene(scene, segment(scene.frame, config)).labels.at(0.8)
+            correct, truth, noise = (
+                correct + found.correct, truth + found.truth_regions, noise + found.noise
+            )  # fmt: skip
+        assert (row["width"], row["frames"]) == (160, 2)
+        assert row["correct"] == pytest.approx(correct / truth) and row["noise_regions"] == noise
+        assert 0 < row["median_ms"] <= row["p95_ms"]
+        assert (row["ratio"] is not None) == bool(installed_peers())
+        line = next(line for line in tables[1].splitlines() if line.startswith(f"| {row['preset']} "))
+        assert f"{correct / truth:.3f} of {truth}" in line and f"{row['median_ms']:.1f}" in line
+        assert f"{correct / truth:.3f} of {truth}" in shown
+
+
+def test_threads_are_those_of_the_kernels_and_of_opencv():
+    before = parallel.threads(), cv2.getNumThreads()
+    try:
+        bench_module.set_threads(1)
+        assert (parallel.threads(), cv2.getNumThreads()) == (1, 1)
+    finally:
+        parallel.set_threads(before[0])
+        cv2.setNumThreads(before[1])
