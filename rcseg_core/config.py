@@ -86,6 +86,12 @@ class NoiseConfig:
         choices=("auto", "constant", "kinect_v1", "realsense_d435"),
         symbol="Sigma_r",
     )
+    range_prior: Literal["none", "kinect_v1", "realsense_d435"] = _param(
+        "none",
+        "sensor whose law fills in, for range_model auto and cameras, where a frame has too few smooth "
+        "windows to tell",
+        choices=("none", "kinect_v1", "realsense_d435"),
+    )
     range_sigma: float = _param(
         0.002, "standard deviation along depth, for range_model constant", unit="m", low=1e-7, high=1.0
     )

@@ -33,6 +33,8 @@ WHITE_BLOCKS = 0.84
 MAX_CORRELATION_PX = 25.0
 #: Share of windows whose residual is taken as pure noise: smooth windows are assumed to be at least half.
 QUANTILE = 0.3
+#: Parts that the signals of a frame are cut into, each of which tells its noise with this many windows.
+PRIOR_PARTS, PRIOR_WINDOWS = 5, 8
 #: Relative floor: no range sensor repeats better than this, and exact synthetic data must not divide by zero.
 RELATIVE_FLOOR = 2e-5
 COLOR_FLOOR_LEVELS = 1.5
@@ -56,7 +58,7 @@ class NoiseModel:
     color : (3,) float64, levels.
     range_correlation, color_correlation : pixels that make one independent measurement, 1 for white noise
     source : str
-        "estimated" or the name of the model.
+        "estimated" (and with which prior) or the name of the model.
     """
 
     range_law: NDArray[np.float64]
@@ -231,6 +233,34 @@ def _range_law(mean: NDArray[np.float64], rms: NDArray[np.float64], floor: float
     return np.asarray(law, np.float64)
 
 
+def _with_prior(windows: _Windows, low: float, high: float, prior: str, floor: float) -> NDArray[np.float64]:
+    """(3,) law of inverse depth from the windows of a frame and, where they are few, the law of its sensor.
+
+    The signals of the frame, `low` to `high`, are cut into PRIOR_PARTS. A part with less than PRIOR_WINDOWS
+    windows, as at a depth that only clutter has, gets what it lacks from the sensor, whose law is scaled
+    first as the windows that there are say, less so where they are few. Fitted is
+    ``sigma = t prior(s) + a + b s + c s^2``, none negative: the prior itself without any window, and what
+    was measured where there are enough.
+    """
+    law = np.array(SENSOR_MODELS[prior])
+    edges = np.linspace(low, max(high, low * (1.0 + 1e-6)), PRIOR_PARTS + 1)
+    lacking = np.maximum(PRIOR_WINDOWS - np.histogram(windows.mean, edges)[0], 0.0)
+    order = np.argsort(windows.mean, kind="stable")
+    parts = [p for p in np.array_split(order, int(np.clip(order.size // 20, 1, 8))) if p.size]
+    s = np.array([float(np.median(windows.mean[p])) for p in parts] + list(0.5 * (edges[1:] + edges[:-1])))
+    powers = np.stack([np.ones_like(s), s, s * s], 1)
+    expected = np.maximum(powers @ law, floor)
+    measured = np.array([max(float(np.quantile(windows.rms[p], QUANTILE)), floor) for p in parts])
+    if parts:
+        trust = order.size / (order.size + PRIOR_WINDOWS)
+        expected *= np.exp(trust * float(np.median(np.log(measured / expected[: len(parts)]))))
+    y = np.concatenate([measured, expected[len(parts) :]])
+    weight = np.sqrt(np.concatenate([[float(p.size) for p in parts], lacking])) / y
+    table = np.concatenate([(powers @ law)[:, None], powers], axis=1)
+    factors, _ = nnls(table * weight[:, None], y * weight)
+    return np.asarray(factors[0] * law + factors[1:], np.float64)
+
+
 def typical_values(signal: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float64]:
     """(Cr,) medians of the valid pixels, of every sixteenth where that leaves enough."""
     coarse = valid[::4, ::4]
@@ -269,6 +299,10 @@ def estimate_noise(
         source = "estimated"
         if inverse_depth:
             law = _range_law(windows[0].mean, windows[0].rms, floor)[None]
+            if config.range_prior != "none":
+                low, high = np.quantile(signal[valid], [0.02, 0.98])
+                law = _with_prior(windows[0], float(low), float(high), config.range_prior, floor)[None]
+                source += f" with prior {config.range_prior}"
         else:
             sigmas = [_quiet_rms(w.rms) for w in windows]
             # a channel cannot be trusted far beyond the noisiest: x and y follow from the same measurement

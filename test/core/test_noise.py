@@ -175,6 +175,53 @@ def test_sensor_models_are_those_of_their_sources(model, sigma_z):
     assert model in SENSOR_MODELS
 
 
+def kinect(w):
+    a, b, c = SENSOR_MODELS["kinect_v1"]
+    return a + b * w + c * w * w
+
+
+def test_without_any_window_the_prior_is_the_law():
+    valid = np.zeros(SHAPE, bool)
+    valid[::7, ::5] = True
+    noise = estimated(room() + white(), valid=valid, range_prior="kinect_v1")
+    np.testing.assert_allclose(noise.range_law, [SENSOR_MODELS["kinect_v1"]], rtol=1e-6)
+    assert noise.source == "estimated with prior kinect_v1"
+
+
+def test_a_frame_that_tells_its_noise_hardly_hears_the_prior():
+    """Three times the noise of the sensor's law, or noise of another shape: what is measured stays."""
+    for sigma in (lambda v: 3 * kinect(v), lambda v: 0.006 * v**2, lambda v: 0.003 + 0 * v):
+        w = room() + sigma(room()) * np.random.default_rng(0).normal(size=SHAPE)
+        noise = estimated(w, range_prior="kinect_v1")
+        for value in (0.3, 0.45, 0.58):
+            assert noise.range_sigma(np.array(value)) == pytest.approx(sigma(value), rel=0.12)
+
+
+def test_the_prior_speaks_where_only_clutter_is():
+    """A smooth wall at 1.25 m, and all that is farther is rough: there is no window there to measure.
+
+    The noise that the wall shows is that of the law; carried on as a constant it would be wrong far away.
+    """
+    rng = np.random.default_rng(0)
+    w = np.full(SHAPE, 0.8)
+    w[:, 200:] = rng.uniform(0.2, 0.6, (SHAPE[0], 120))
+    w += kinect(w) * rng.normal(size=SHAPE)
+    valid = np.ones(SHAPE, bool)
+    valid[:, 200:] = rng.random((SHAPE[0], 120)) < 0.4  # too few in any window
+    far, near = np.array(0.25), np.array(0.8)
+    alone, both = estimated(w, valid), estimated(w, valid, range_prior="kinect_v1")
+    assert both.range_sigma(near) == pytest.approx(kinect(0.8), rel=0.15)
+    assert both.range_sigma(far) == pytest.approx(kinect(0.25), rel=0.15)
+    assert alone.range_sigma(far) != pytest.approx(kinect(0.25), rel=0.15)
+
+
+def test_a_fixed_law_takes_no_prior():
+    w = room() + white()
+    fixed = estimated(w, range_model="kinect_v1", range_prior="realsense_d435")
+    np.testing.assert_array_equal(fixed.range_law, estimated(w, range_model="kinect_v1").range_law)
+    assert fixed.source == "kinect_v1"
+
+
 @pytest.mark.parametrize("model", ["constant", "kinect_v1", "realsense_d435", "auto"])
 def test_scanner_grids_have_one_sigma_a_channel(model):
     rows, cols = np.mgrid[:120, :160]

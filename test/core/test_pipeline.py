@@ -144,6 +144,7 @@ def test_invalid_pixels_and_impulses_leave_the_regions_whole():
 CHANGES = {
     "signal.kind": ("xyz", "inverse_depth"),
     "noise.range_model": ("constant", "kinect_v1", "realsense_d435"),
+    "noise.range_prior": ("kinect_v1", "realsense_d435"),
     "reflectance.mode": ("active",),
     "seeds.fit": ("lms",),
     "grouping.order": ("joint", "range_only"),
