@@ -262,6 +262,14 @@ class AbsorptionConfig:
 
 
 @dataclass(frozen=True)
+class BordersConfig:
+    """Where surfaces end (Boulanger, Osorio & Prieto 2005)."""
+
+    sharpen: bool = _param(True, "borders of surfaces that meet lie where their models intersect")
+    reach: int = _param(4, "borders at most this far from the intersection move to it", unit="px", low=1, high=50)
+
+
+@dataclass(frozen=True)
 class SegmenterConfig:
     """The whole configuration. Frozen; variants come from `replace`, `from_dict` or `dataclasses.replace`."""
 
@@ -273,6 +281,7 @@ class SegmenterConfig:
     grouping: GroupingConfig = GroupingConfig()
     generalization: GeneralizationConfig = GeneralizationConfig()
     absorption: AbsorptionConfig = AbsorptionConfig()
+    borders: BordersConfig = BordersConfig()
 
     def __post_init__(self) -> None:
         for parameter in describe(self):
@@ -354,6 +363,7 @@ class SegmenterConfig:
                 "grouping.edge_gate": False,
                 "generalization.hypothesis": "region",
                 "generalization.test": "f",
+                "borders.sharpen": False,
             }
         )
 

@@ -219,3 +219,10 @@ class Partition:
         order = np.concatenate([[0], order])
         self._relabel(mapping, order)
         return order
+
+
+def majority(partition: Partition, surfaces: Partition) -> NDArray[np.int64]:
+    """(count + 1,) the surface that holds most of each region's pixels (the lowest of equals)."""
+    counts = np.zeros((partition.count + 1, surfaces.count + 1), np.int64)
+    count_together(partition.labels, surfaces.labels, counts)
+    return np.asarray(np.argmax(counts, axis=1), np.int64)

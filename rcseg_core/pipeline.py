@@ -13,7 +13,7 @@ from rcseg_core.description import describe_regions
 from rcseg_core.edges import RANGE_EDGES, detect_edges
 from rcseg_core.errors import ConfigError
 from rcseg_core.frame import RangeColorFrame
-from rcseg_core.partition import Partition
+from rcseg_core.partition import Partition, majority
 from rcseg_core.reduction import LEAST_SIDE_PX, at_full_size, reduced, unreduced
 from rcseg_core.reflectance import normalize_reflectance
 from rcseg_core.seeds import initial_partition
@@ -27,9 +27,10 @@ from rcseg_core.stages import (
     group_pass,
     link_signals,
     settle,
+    sharpen_borders,
     top_degree,
 )
-from rcseg_core.surfaces import bridge_holes, majority, number_surfaces, surfaces_of
+from rcseg_core.surfaces import bridge_holes, number_surfaces, surfaces_of
 
 #: Made once: every parameter is checked when a configuration is made.
 DEFAULT = SegmenterConfig()
@@ -88,7 +89,10 @@ def segment(
         within = bridge_holes(surfaces.labels)
         partition = partition_by(signals.color_only(), edges, config, within, clock, "color")
         if config.absorption.enabled:
-            link_signals(partition, signals, edges, config)
+            link_signals(partition, surfaces, signals, edges, config)
+    elif config.absorption.enabled and config.borders.sharpen:
+        sharpen_borders(partition, partition, final_models(partition, signals, config)[1], signals, edges, config)
+        clock.lap("borders")
     return conclude(frame, signals, edges, partition, surfaces, config, clock)
 
 

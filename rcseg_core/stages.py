@@ -6,13 +6,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rcseg_core.adjacency import Pairs
+from rcseg_core.borders import Sides, sharpen
 from rcseg_core.config import SegmenterConfig
 from rcseg_core.continuity import continuous_pairs
 from rcseg_core.generalization import choose_degrees, residuals_by_degree
 from rcseg_core.grouping import Grouped, add_merged, group
 from rcseg_core.models import Models, fit_models
 from rcseg_core.moments import Moments, plane_exponents, tensor_exponents
-from rcseg_core.partition import Partition
+from rcseg_core.partition import Partition, majority
 from rcseg_core.rule import KINDS, POINTS, Rule
 from rcseg_core.signals import MISFIT, Signals, scales
 
@@ -123,8 +124,11 @@ def absorb_points(partition: Partition, signals: Signals, models: Models, config
     return partition.add_leftovers(signals.flags, scaled(config.absorption.min_region, signals.flags))
 
 
-def settle(partition: Partition, signals: Signals, config: SegmenterConfig) -> None:
-    """Specks dissolve into the neighbours that predict them; every measured pixel gets a region."""
+def settle(partition: Partition, signals: Signals, config: SegmenterConfig) -> Models:
+    """Specks dissolve into the neighbours that predict them; every measured pixel gets a region.
+
+    Returns the models that the last choices were made by.
+    """
     partition.drop_small(scaled(config.absorption.speck, signals.flags))
     models = final_models(partition, signals, config)[1]
     if absorb_points(partition, signals, models, config):
@@ -137,6 +141,7 @@ def settle(partition: Partition, signals: Signals, config: SegmenterConfig) -> N
         partition.refine(signals, models, config.absorption.refine_passes)
     else:  # small parts of `within` that no region reached
         partition.add_leftovers(signals.flags, 1)
+    return models
 
 
 def scaled(pixels: int, image: NDArray[np.uint8]) -> int:
@@ -172,13 +177,36 @@ def absorb_small(
 
 
 def link_signals(
-    partition: Partition, signals: Signals, edges: NDArray[np.uint8], config: SegmenterConfig
+    partition: Partition, surfaces: Partition, signals: Signals, edges: NDArray[np.uint8], config: SegmenterConfig
 ) -> None:
     """Regions of colour meet the range again: both decide what small regions and border pixels belong to."""
     partition.within = None
     partition.forget()
-    settle(partition, signals, config)
+    models = settle(partition, signals, config)
+    sharpen_borders(partition, surfaces, models, signals, edges, config)
     absorb_small(partition, signals, edges, config)
+
+
+def sharpen_borders(
+    partition: Partition, surfaces: Partition, regions: Models, signals: Signals, edges: NDArray[np.uint8],
+    config: SegmenterConfig,
+) -> None:  # fmt: skip
+    """Move the borders between surfaces to where their models intersect.
+
+    surfaces : found from the range alone, or `partition` itself, whose models are `regions`
+    """
+    if not config.borders.sharpen:
+        return
+    models = regions
+    if surfaces is not partition:
+        models = final_models(surfaces, signals.range_only(), config)[1]
+    # what pixels do not average away, and the mean variance of a fit (its terms over independent pixels)
+    terms = (models.degree[:, 0] + 1.0) ** 2
+    independent = np.maximum(surfaces.sizes() / correlation(signals)[0], 1.0)
+    doubt = config.grouping.noise_share**2 + terms / independent
+    sides = Sides(majority(partition, surfaces), models, doubt)
+    if sharpen(signals, edges, partition.labels, partition.leaves, sides, regions, config.borders.reach):
+        partition.forget()
 
 
 def top_degree(signals: Signals, config: SegmenterConfig) -> int:

@@ -13,7 +13,7 @@ from rcseg_core.adjacency import Pairs, spread
 from rcseg_core.config import SegmenterConfig
 from rcseg_core.grouping import group
 from rcseg_core.moments import Moments
-from rcseg_core.partition import Partition, count_together, relabel
+from rcseg_core.partition import Partition, relabel
 from rcseg_core.signals import Signals
 from rcseg_core.stages import copied, make_rule
 
@@ -50,13 +50,6 @@ def surfaces_of(
     rule = make_rule(signals, degree, config, use_color=False)
     grouped = group(copied(moments), boxes.copy(), pairs, rule, config.grouping.edge_gate)
     return _groups(partition.count, grouped.merges)
-
-
-def majority(partition: Partition, surfaces: Partition) -> NDArray[np.int64]:
-    """(count + 1,) the surface that holds most of each region's pixels (the lowest of equals)."""
-    counts = np.zeros((partition.count + 1, surfaces.count + 1), np.int64)
-    count_together(partition.labels, surfaces.labels, counts)
-    return np.asarray(np.argmax(counts, axis=1), np.int64)
 
 
 def number_surfaces(

@@ -15,9 +15,12 @@ from rcseg_core.synthetic import make_scene
 #: Tests of kernels on small arrays; those of whole frames would take minutes without the compiler.
 KERNEL_TESTS = (
     "moments", "planes", "adjacency", "evidence", "grouping", "models", "continuity", "hierarchy", "cleaning",
-    "generalization", "partition", "rendering", "shapes", "extents",
+    "generalization", "partition", "rendering", "shapes", "extents", "borders",
 )  # fmt: skip
-SLOW = "vga or noise_alone or null_hypothesis or pure_noise or many_small or as_large_as_they_say"
+SLOW = (
+    "vga or noise_alone or null_hypothesis or pure_noise or many_small or as_large_as_they_say or "
+    "creases_of_scenes"
+)
 
 interpreted = pytest.mark.skipif(
     bool(os.environ.get("NUMBA_DISABLE_JIT")), reason="this run is interpreted already"
