@@ -1,9 +1,10 @@
-"""Borders where surfaces meet: on the curve in which their models intersect (Boulanger, Osorio & Prieto 2005).
+"""Borders where surfaces meet: on the curve in which their models intersect.
 
-Near a crease both models predict a pixel within its noise, so that a choice pixel by pixel is a matter of
-chance. The models know better: they average thousands of pixels and cross along a sharp curve. Which side of
-it belongs to which surface does not change along a ridge or a valley, and the pixels a few steps away from
-the border are sure of theirs: they vote.
+Boulanger, Osorio & Prieto (2005) recompute the boundaries of regions in this way. Near a crease both models
+predict a pixel within its noise, so that a choice pixel by pixel is a matter of chance. The models know
+better: they average thousands of pixels and cross along a sharp curve. Which side of it belongs to which
+surface does not change along a ridge or a valley, and pixels a few steps away from the border are sure of
+theirs: they vote.
 """
 
 from __future__ import annotations
@@ -28,6 +29,16 @@ VETO = 9.0
 BLUR_PX = 0.2
 #: The colour of one pixel counts no more than this, sigma^2.
 MAX_COLOR_COST = 16.0
+
+
+class Pixels(NamedTuple):
+    """What was measured, see `signals.Signals`."""
+
+    image: NDArray[np.float32]
+    flags: NDArray[np.uint8]
+    law: NDArray[np.float64]
+    n_range: int
+    color_eps2: float
 
 
 class Sides(NamedTuple):
@@ -141,20 +152,20 @@ def collect(labels, sides, channel, reach, queue, votes):  # type: ignore[no-unt
 
 
 @bare
-def _color_cost(models, k, image, flags, row, col, n_range, color_eps2):  # type: ignore[no-untyped-def]
+def _color_cost(pixels, models, k, row, col):  # type: ignore[no-untyped-def]
     """Squared residual of the colour of a pixel under region k, over its noise and half of the tolerance."""
-    channels = image.shape[2]
-    if channels == n_range or flags[row, col] & COLOR_OUTLIER != 0:
+    channels = pixels.image.shape[2] - pixels.n_range
+    if channels == 0 or pixels.flags[row, col] & COLOR_OUTLIER != 0:
         return 0.0
     total = 0.0
-    for c in range(n_range, channels):
-        d = image[row, col, c] - predict(models, k, row, col, 1, c)
+    for c in range(pixels.n_range, pixels.n_range + channels):
+        d = pixels.image[row, col, c] - predict(models, k, row, col, 1, c)
         total += d * d
-    return min(total / (1.0 + 0.25 * color_eps2 / (channels - n_range)), MAX_COLOR_COST)
+    return min(total / (1.0 + 0.25 * pixels.color_eps2 / channels), MAX_COLOR_COST)
 
 
 @bare
-def _gain(image, flags, labels, sides, regions, n_range, law, color_eps2, reach, votes, row, col, r, c):  # type: ignore[no-untyped-def]
+def _gain(pixels, labels, sides, regions, reach, votes, row, col, r, c):  # type: ignore[no-untyped-def]
     """What speaks for a pixel's move to the surface of a neighbour (sigma^2); not positive: it stays.
 
     The signed square of the models' difference over its variance, and the difference of the colour costs. The
@@ -169,21 +180,21 @@ def _gain(image, flags, labels, sides, regions, n_range, law, color_eps2, reach,
     _, slot = _slot(votes, sides, a, b)
     if abs(votes.balance[slot]) < max(LEAST_BALANCE * votes.total[slot], 1.0):
         return 0.0
-    difference, slope, mean = _crossing(sides, a, b, row, col, n_range - 1)
+    channel = pixels.n_range - 1
+    difference, slope, mean = _crossing(sides, a, b, row, col, channel)
     if abs(difference) > reach * slope:
         return 0.0
-    var, _ = local_scales(law, mean)
-    if flags[row, col] & RANGE_OUTLIER == 0:
+    var, _ = local_scales(pixels.law, mean)
+    if pixels.flags[row, col] & RANGE_OUTLIER == 0:
         # residual of b squared minus residual of a squared
-        own = image[row, col, n_range - 1] - mean
+        own = pixels.image[row, col, channel] - mean
         if 2.0 * own * difference > VETO * var:
             return 0.0
     spread = var * (sides.doubt[a] + sides.doubt[b]) + (BLUR_PX * slope) ** 2
     gain = difference * abs(difference) / spread if spread > 0.0 else 0.0
     if votes.balance[slot] > 0.0:  # each has the larger signal on its own side
         gain = -gain
-    gain += _color_cost(regions, k, image, flags, row, col, n_range, color_eps2)
-    return gain - _color_cost(regions, m, image, flags, row, col, n_range, color_eps2)
+    return gain + _color_cost(pixels, regions, k, row, col) - _color_cost(pixels, regions, m, row, col)
 
 
 @bare
@@ -207,10 +218,7 @@ def parts(values, value, key_of, row, col):  # type: ignore[no-untyped-def]
 
 
 @bare
-def move(
-    image, flags, edges, labels, leaves, sides, regions, itself, n_range, law, color_eps2, reach, votes, queue,
-    queued, end,
-):  # type: ignore[no-untyped-def]  # fmt: skip
+def move(pixels, edges, labels, leaves, sides, regions, itself, reach, votes, queue, queued, end):  # type: ignore[no-untyped-def]
     """Pixels on the other side of an intersection join it: from the border outwards, a ring at a time.
 
     queue : (2, pixels) int64, the first `end` of its first row are the pixels to begin with; queued : (H, W)
@@ -235,9 +243,7 @@ def move(
                 c = col + (d == 3) - (d == 2)
                 if r < 0 or c < 0 or r >= height or c >= width or labels[r, c] == k:
                     continue
-                gain = _gain(
-                    image, flags, labels, sides, regions, n_range, law, color_eps2, reach, votes, row, col, r, c
-                )
+                gain = _gain(pixels, labels, sides, regions, reach, votes, row, col, r, c)
                 if gain > best_gain:
                     best_gain = gain
                     best = r * width + c
@@ -282,17 +288,14 @@ def sharpen(
     int
         Number of moved pixels.
     """
-    pixels, count = labels.size, sides.doubt.size
-    size = 1 << int(np.ceil(np.log2(16 * (count + 16))))
-    queue = np.empty((2, pixels), np.int64)
+    size = 1 << int(np.ceil(np.log2(16 * (sides.doubt.size + 16))))
+    queue = np.empty((2, labels.size), np.int64)
     end = -1
     while end < 0:
         votes = Votes(np.full(size, -1, np.int64), np.zeros(size), np.zeros(size))
         end = collect(labels, sides, signals.n_range - 1, reach, queue, votes)
         size *= 2
-    moved: int = move(
-        signals.image, signals.flags, edges, labels, leaves, sides, regions, np.arange(sides.surface_of.size),
-        signals.n_range, signals.law, signals.color_eps2, reach, votes, queue,
-        np.zeros(labels.shape, np.uint8), end,
-    )  # fmt: skip
+    pixels = Pixels(signals.image, signals.flags, signals.law, signals.n_range, signals.color_eps2)
+    itself, queued = np.arange(sides.surface_of.size), np.zeros(labels.shape, np.uint8)
+    moved: int = move(pixels, edges, labels, leaves, sides, regions, itself, reach, votes, queue, queued, end)
     return moved

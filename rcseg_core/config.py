@@ -266,7 +266,9 @@ class BordersConfig:
     """Where surfaces end (Boulanger, Osorio & Prieto 2005)."""
 
     sharpen: bool = _param(True, "borders of surfaces that meet lie where their models intersect")
-    reach: int = _param(4, "borders at most this far from the intersection move to it", unit="px", low=1, high=50)
+    reach: int = _param(
+        4, "borders at most this far from the intersection move to it", unit="px", low=1, high=50
+    )
 
 
 @dataclass(frozen=True)

@@ -90,9 +90,6 @@ def segment(
         partition = partition_by(signals.color_only(), edges, config, within, clock, "color")
         if config.absorption.enabled:
             link_signals(partition, surfaces, signals, edges, config)
-    elif config.absorption.enabled and config.borders.sharpen:
-        sharpen_borders(partition, partition, final_models(partition, signals, config)[1], signals, edges, config)
-        clock.lap("borders")
     return conclude(frame, signals, edges, partition, surfaces, config, clock)
 
 
@@ -136,7 +133,9 @@ def partition_by(
         if not config.absorption.enabled:
             break
         if round_ == 0:
-            settle(partition, signals, config)
+            models = settle(partition, signals, config)
+            if within is None:
+                sharpen_borders(partition, partition, models, signals, edges, config)
         if within is None:  # within surfaces, both signals judge small regions later
             absorb_small(partition, signals, edges, config)
         clock.lap(f"{name} absorb")

@@ -177,8 +177,9 @@ def absorb_small(
 
 
 def link_signals(
-    partition: Partition, surfaces: Partition, signals: Signals, edges: NDArray[np.uint8], config: SegmenterConfig
-) -> None:
+    partition: Partition, surfaces: Partition, signals: Signals, edges: NDArray[np.uint8],
+    config: SegmenterConfig,
+) -> None:  # fmt: skip
     """Regions of colour meet the range again: both decide what small regions and border pixels belong to."""
     partition.within = None
     partition.forget()

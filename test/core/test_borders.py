@@ -207,7 +207,7 @@ def test_a_border_without_a_clear_side_stays():
 
 @pytest.mark.parametrize("ring", range(256))
 def test_connectivity_of_every_neighbourhood(ring):
-    """Against counting: 4-connected parts of the ring of eight that touch the pixel; none when all is full."""
+    """Against counting: parts of the ring of eight that touch the pixel by a side; none when all is full."""
     window = np.zeros((3, 3), np.int32)
     for i, (r, c) in enumerate(naive_borders.RING):
         window[r, c] = ring >> i & 1

@@ -52,7 +52,6 @@ def wrong_beside_creases(truth, depth, labels, step=0.015, reach=8):
     owner[0] = 0
     found = owner[labels]
     near = np.zeros(truth.shape, bool)
-    height, width = truth.shape
     wrong = np.zeros(truth.shape, bool)
     for a, b in ((np.s_[:-1, :], np.s_[1:, :]), (np.s_[:, :-1], np.s_[:, 1:])):
         differ = (truth[a] != truth[b]) & (truth[a] > 0) & (truth[b] > 0)
