@@ -150,8 +150,10 @@ def _normals(
     camera: PinholeCamera | None,
 ) -> NDArray[np.float64]:  # fmt: skip
     """(n, 3) unit normals of range patches at one pixel each, towards the sensor; NaN where degenerate."""
+    if not patches:
+        return np.empty((0, 3))
     values, by_row, by_col = jets(patches, rows, cols)
-    if camera is not None and patches and patches[0].kind == "inverse_depth":
+    if camera is not None and patches[0].kind == "inverse_depth":
         # tangent plane n.X = 1 with X = ray / w, so w = n.ray: linear in the pixel coordinates
         nx, ny = by_col[:, 0] * camera.fx, by_row[:, 0] * camera.fy
         x, y = (cols - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy
