@@ -95,9 +95,10 @@ class Partition:
         self._moments: Moments | None = None
         #: labels of the pixels that the moments hold; the pixels that differ are added and taken away
         self._counted: NDArray[np.int32] | None = None
-        self._pixels_changed()
+        self.pixels_changed()
 
-    def _pixels_changed(self) -> None:
+    def pixels_changed(self) -> None:
+        """Pixels have changed their regions: boxes and pairs are void, moments are carried along."""
         self._boxes: NDArray[np.int64] | None = None
         self._pairs: Pairs | None = None
         self._current = False
@@ -138,12 +139,12 @@ class Partition:
     def absorb(self, signals: Signals, models: Models, max_cost: float) -> None:
         """Grow the regions over unassigned pixels that they predict."""
         if absorb(signals, self.labels, self.leaves, models, max_cost, self.within):
-            self._pixels_changed()
+            self.pixels_changed()
 
     def refine(self, signals: Signals, models: Models, passes: int) -> None:
         """Let boundary pixels move to the region that predicts them better."""
         if refine(signals, self.labels, self.leaves, models, passes):
-            self._pixels_changed()
+            self.pixels_changed()
 
     def apply(self, grouped: Grouped) -> NDArray[np.int64]:
         """Carry out the merges: relabel, record. Returns the old label of each new region, (count + 1,)."""
@@ -185,7 +186,7 @@ class Partition:
         self.nodes[inner] += extra
         self.nodes = np.concatenate([self.nodes, np.arange(old_leaves + 1, old_leaves + extra + 1)])
         self.count += extra
-        self._pixels_changed()
+        self.pixels_changed()
         if self._moments is not None:
             self._moments = extended(self._moments, self.boxes())
         return extra

@@ -207,7 +207,7 @@ def sharpen_borders(
     doubt = config.grouping.noise_share**2 + terms / independent
     sides = Sides(majority(partition, surfaces), models, doubt)
     if sharpen(signals, edges, partition.labels, partition.leaves, sides, regions, config.borders.reach):
-        partition.forget()
+        partition.pixels_changed()
 
 
 def top_degree(signals: Signals, config: SegmenterConfig) -> int:
