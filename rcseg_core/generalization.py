@@ -123,6 +123,8 @@ def choose_degrees(
                     effect = (rss_low - rss_high) / np.maximum(n, 1)
                     asked &= effect > config.min_effect**2 * width * variance[:, modality]
                 k = np.nonzero(asked)[0]
+                if not k.size:
+                    continue
                 independent = n[k] / correlation[modality]
                 p_value = f_test(rss_low[k], rss_high[k], independent, p_low, p_high, width)
                 degree[k[p_value < config.alpha], modality] = high

@@ -62,6 +62,9 @@ def predict(models, k, row, col, modality, c):  # type: ignore[no-untyped-def]
     degree = models.degree[k, modality]
     x = (col - models.center[k, 0]) / UNIT_PX
     y = (row - models.center[k, 1]) / UNIT_PX
+    if degree == 1:  # the most frequent one
+        m = models.coef
+        return m[k, c, 0, 0] + m[k, c, 0, 1] * y + (m[k, c, 1, 0] + m[k, c, 1, 1] * y) * x
     total = 0.0
     for a in range(degree, -1, -1):
         part = 0.0

@@ -36,6 +36,26 @@ SAME_SIDE = 0.02
 
 
 @bare
+def _side(points, valid, row0, row1, col0, col1):  # type: ignore[no-untyped-def]
+    """How many pixels of a square are near in depth to the one that most are near to, and its depth."""
+    best = 0
+    center = np.nan
+    for row in range(row0, row1):
+        for col in range(col0, col1):
+            if not valid[row, col]:
+                continue
+            z = np.float64(points[row, col, 2])
+            company = 0
+            for r in range(row0, row1):
+                for c in range(col0, col1):
+                    company += valid[r, c] and abs(points[r, c, 2] - z) <= SAME_SIDE * abs(z)
+            if company > best:
+                best = company
+                center = z
+    return best, center
+
+
+@bare
 def _average(points, valid, color, step, inverse, first, last, out_points, out_color):  # type: ignore[no-untyped-def]
     """Means of squares of `step` pixels, rows first..last-1 of the output; NaN where no pixel is valid.
 
@@ -47,21 +67,19 @@ def _average(points, valid, color, step, inverse, first, last, out_points, out_c
             row1 = min((i + 1) * step, height)
             col1 = min((j + 1) * step, width)
             # the pixel with most company in depth stands for its side of the square
-            best = -1
+            best = 0
             center = np.nan
+            least = np.inf
+            most = -np.inf
             for row in range(i * step, row1):
                 for col in range(j * step, col1):
-                    if not valid[row, col]:
-                        continue
-                    z = np.float64(points[row, col, 2])
-                    company = 0
-                    for r in range(i * step, row1):
-                        for c in range(j * step, col1):
-                            if valid[r, c] and abs(points[r, c, 2] - z) <= SAME_SIDE * abs(z):
-                                company += 1
-                    if company > best:
-                        best = company
-                        center = z
+                    if valid[row, col]:
+                        center = np.float64(points[row, col, 2])
+                        least = min(least, center)
+                        most = max(most, center)
+                        best += 1
+            if best > 0 and most - least > SAME_SIDE * min(abs(least), abs(most)):
+                best, center = _side(points, valid, i * step, row1, j * step, col1)
             x = y = z = red = green = blue = n = 0.0
             for row in range(i * step, row1):
                 for col in range(j * step, col1):
@@ -92,6 +110,7 @@ def _rays(camera: PinholeCamera, height: int, width: int) -> NDArray[np.float32]
     return camera.rays(height, width)
 
 
+@cache
 def unreduced(config: SegmenterConfig) -> SegmenterConfig:
     """What the small image is segmented with: its colour is normalised already."""
     return config.replace({"signal.reduction": 1, "reflectance.mode": "none"})
@@ -120,18 +139,23 @@ def reduced(frame: RangeColorFrame, color: NDArray[np.uint8], step: int) -> Rang
 
 
 @bare
-def _repeat(image, mapping, flags, step, first, last, out):  # type: ignore[no-untyped-def]
-    """out[row, col] = mapping[image[row // step, col // step]], 0 on flagged pixels."""
+def _repeat(image, flags, step, first, last, out):  # type: ignore[no-untyped-def]
+    """out[row, col] = image[row // step, col // step], 0 on flagged pixels."""
+    width = out.shape[1]
     for row in range(first, last):
-        for col in range(out.shape[1]):
-            out[row, col] = mapping[image[row // step, col // step]] if flags[row, col] == 0 else 0
+        i = row // step
+        col = 0
+        for j in range(image.shape[1]):
+            value = image[i, j]
+            for _ in range(min(step, width - col)):
+                out[row, col] = value if flags[row, col] == 0 else 0
+                col += 1
 
 
 def _enlarged(image: NDArray[Any], flags: NDArray[np.uint8], step: int) -> NDArray[Any]:
     """`image` with every pixel repeated; 0 where flagged."""
     out = np.empty(flags.shape, image.dtype)
-    same = np.arange(int(image.max(initial=0)) + 1)
-    over_bands(len(out), lambda _, a, b: _repeat(image, same, flags, step, a, b, out))
+    over_bands(len(out), lambda _, a, b: _repeat(image, flags, step, a, b, out))
     return out
 
 

@@ -297,27 +297,39 @@ def measured_again(
     No impulses are looked for, and `cleaned` is the image itself.
     """
     n = signals.n_range
-    raw = range_signal(frame, signals.inverse_depth)
     scale = signals.scale * noise_factor
     law = signals.law.copy()
     law[:3] *= noise_factor ** np.arange(3)  # of a value in other units; sigma itself grows as they do
     law[3] /= noise_factor
-    image = np.empty((*frame.valid.shape, n + 3), np.float32)
-    cleaned, cleaned_color = np.empty_like(raw), np.empty(color.shape, np.uint8)
-    flags = np.empty(frame.valid.shape, np.uint8)
+    raw = range_signal(frame, signals.inverse_depth)
+    image, flags = np.empty((*frame.valid.shape, n + 3), np.float32), np.empty(frame.valid.shape, np.uint8)
     levels = ((np.arange(256.0) - signals.offset[n:, None]) / scale[n:, None]).astype(np.float32)
+    gain, offset = (1.0 / scale).astype(np.float32), signals.offset.astype(np.float32)
     over_bands(
         frame.height,
-        lambda _, first, last: whiten(
-            raw, raw, color, color, frame.valid, scale, signals.offset, levels, law, 0.0, first, last, image,
-            cleaned, cleaned_color, flags,
+        lambda _, first, last: _whiten_only(
+            raw, color, frame.valid, gain, offset, levels, first, last, image, flags
         ),
-    )  # fmt: skip
+    )
     return replace(
-        signals, image=image, cleaned=cleaned, cleaned_color=cleaned_color, flags=flags, scale=scale, law=law,
+        signals, image=image, cleaned=image[..., :n], cleaned_color=color, flags=flags, scale=scale, law=law,
         color_eps2=signals.color_eps2 / noise_factor**2,
         slope=(signals.slope[0] / noise_factor, signals.slope[1]),
     )  # fmt: skip
+
+
+@bare
+def _whiten_only(raw, color, valid, gain, offset, levels, first, last, image, flags):  # type: ignore[no-untyped-def]
+    """Rows of image (H, W, C) float32, and flags: only what is invalid."""
+    n_range = raw.shape[2]
+    for row in range(first, last):
+        for col in range(raw.shape[1]):
+            flags[row, col] = 0 if valid[row, col] else INVALID
+            for c in range(n_range):
+                value = (raw[row, col, c] - offset[c]) * gain[c]
+                image[row, col, c] = value if valid[row, col] else np.float32(0.0)
+            for c in range(3):
+                image[row, col, n_range + c] = levels[c, color[row, col, c]]
 
 
 @bare
