@@ -63,7 +63,8 @@ class SignalConfig:
 
     kind: Literal["auto", "inverse_depth", "xyz"] = _param(
         "auto",
-        "auto: inverse depth where a camera model is known, else x, y, z (the paper)",
+        "auto: inverse depth where a camera model is known or the rays of the grid pass through one point, "
+        "else x, y, z (the paper)",
         choices=("auto", "inverse_depth", "xyz"),
         symbol="eta_r",
     )

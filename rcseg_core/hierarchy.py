@@ -25,7 +25,7 @@ class Scale:
 
     Attributes
     ----------
-    depth_m : median depth of the frame, m; for scanner grids, whose tolerance is one length everywhere, NaN
+    depth_m : median depth of the frame, m; NaN for x, y, z, whose tolerance is one length everywhere
     tolerance_m : the configured range tolerance there, m
     sigma_m : standard deviation of the range there, m, one pixel's
     """

@@ -31,6 +31,7 @@ from rcseg_core.stages import (
     top_degree,
 )
 from rcseg_core.surfaces import bridge_holes, number_surfaces, surfaces_of
+from rcseg_core.views import carried_back, pinhole_view
 
 #: Made once: every parameter is checked when a configuration is made.
 DEFAULT = SegmenterConfig()
@@ -68,6 +69,10 @@ def segment(
 
     # 1. normalise the colour (section 3) and find the discontinuities (section 8)
     color = normalize_reflectance(frame, config.reflectance, white_reference)
+    view = pinhole_view(frame, color, config)
+    if view is not None:  # a scanner's grid is segmented as a pinhole camera in its centre would see it
+        result = segment(view.frame, config.replace({"reflectance.mode": "none"}))
+        return carried_back(view, result, frame, color, config)
     if config.signal.reduction > 1 and min(frame.valid.shape) >= LEAST_SIDE_PX:  # coarse to fine
         small = segment(reduced(frame, color, config.signal.reduction), unreduced(config))
         return at_full_size(frame, color, small, config)

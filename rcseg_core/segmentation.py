@@ -110,6 +110,8 @@ class Segmentation:
     nodes: NDArray[np.int64] = field(repr=False)
     coarsen: Callable[[], Grouped] = field(repr=False)
     describe: Callable[[], Sequence[Region]] = field(repr=False)
+    #: The result in the virtual camera that a scanner's grid was segmented in; None where it was not.
+    view: Segmentation | None = field(default=None, repr=False)
 
     @cached_property
     def _measured(self) -> tuple[Signals, Models]:
@@ -138,6 +140,8 @@ class Segmentation:
     @cached_property
     def scale(self) -> Scale:
         """What the levels of the merge tree are in metres and in sigmas."""
+        if self.view is not None:
+            return self.view.scale
         signals = self.signals
         typical = float(signals.offset[0])
         if signals.inverse_depth:

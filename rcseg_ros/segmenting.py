@@ -126,7 +126,8 @@ def noise_document(result: Segmentation) -> dict[str, Any]:
 
     ``range_law``: sigma = a + b s + c s^2 of the signal s for each range channel, in ``range_unit``;
     ``color``: standard deviations in grey levels; correlations in pixels; ``median_depth_m``: null for
-    scanner grids; ``sigma_m``, ``tolerance_m``: standard deviation of range and approximation limit there.
+    grids of parallel rays; ``sigma_m``, ``tolerance_m``: standard deviation of range and approximation limit
+    there.
     """
     scale = result.scale
     return plain(result.noise) | {

@@ -16,6 +16,7 @@ from rcseg_core.synthetic import make_scene
 KERNEL_TESTS = (
     "moments", "planes", "adjacency", "evidence", "grouping", "models", "continuity", "hierarchy", "cleaning",
     "generalization", "partition", "rendering", "shapes", "extents", "borders",
+    "views",
 )  # fmt: skip
 SLOW = (
     "vga or noise_alone or null_hypothesis or pure_noise or many_small or as_large_as_they_say or "
