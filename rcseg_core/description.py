@@ -24,6 +24,46 @@ from rcseg_core.signals import Signals
 
 
 @bare
+def _sum_points(points, flags, row, start, end, total):  # type: ignore[no-untyped-def]
+    """x, y, z and number of the measured points of a run. Sums in registers: in an array each would wait for
+    the one before."""
+    x = y = z = n = 0.0
+    for col in range(start, end):
+        if flags[row, col] == 0:
+            x += points[row, col, 0]
+            y += points[row, col, 1]
+            z += points[row, col, 2]
+            n += 1.0
+    total[0] = x
+    total[1] = y
+    total[2] = z
+    total[3] = n
+
+
+@bare
+def _sum_three(image, flags, row, start, end, first, run):  # type: ignore[no-untyped-def]
+    """Lower triangle of the products of the three channels from `first` on, over a run."""
+    rr = rg = rb = gg = gb = bb = 0.0
+    for col in range(start, end):
+        if flags[row, col] == 0:
+            r = np.float64(image[row, col, first])
+            g = np.float64(image[row, col, first + 1])
+            b = np.float64(image[row, col, first + 2])
+            rr += r * r
+            rg += r * g
+            rb += r * b
+            gg += g * g
+            gb += g * b
+            bb += b * b
+    run[first, first] = rr
+    run[first + 1, first] = rg
+    run[first + 1, first + 1] = gg
+    run[first + 2, first] = rb
+    run[first + 2, first + 1] = gb
+    run[first + 2, first + 2] = bb
+
+
+@bare
 def _sums(points, image, flags, labels, n_range, first, last, run, centroid, products):  # type: ignore[no-untyped-def]
     """Over rows first..last-1 the sums of the measured points (N + 1, 4: x, y, z, n) and of channel products
     within each modality; run : (C + 1, C + 4) scratch, the sums of one run of a label."""
@@ -35,17 +75,20 @@ def _sums(points, image, flags, labels, n_range, first, last, run, centroid, pro
             if k <= 0:
                 col += 1
                 continue
-            run[:, :] = 0.0
+            start = col
             while col < width and labels[row, col] == k:
-                if flags[row, col] == 0:
-                    for c in range(3):
-                        run[channels, c] += points[row, col, c]
-                    run[channels, 3] += 1.0
-                    for a in range(channels):
-                        value = np.float64(image[row, col, a])
-                        for b in range(0 if a < n_range else n_range, a + 1):
-                            run[a, b] += value * image[row, col, b]
                 col += 1
+            run[:, :] = 0.0
+            _sum_points(points, flags, row, start, col, run[channels])
+            if n_range == 3:
+                _sum_three(image, flags, row, start, col, 0, run)
+            else:
+                total = 0.0
+                for at in range(start, col):
+                    if flags[row, at] == 0:
+                        total += np.float64(image[row, at, 0]) * np.float64(image[row, at, 0])
+                run[0, 0] = total
+            _sum_three(image, flags, row, start, col, n_range, run)
             for c in range(4):
                 centroid[k, c] += run[channels, c]
             for a in range(channels):

