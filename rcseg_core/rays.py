@@ -94,7 +94,8 @@ def _usable(frame: RangeColorFrame) -> tuple[Array, Array]:
     points = np.where(frame.valid[..., None], frame.points, np.nan).astype(np.float64)
     range_m = np.sqrt(np.einsum("ijk,ijk->ij", points, points))
     with np.errstate(invalid="ignore"):
-        range_m[range_m < MIN_DEPTH_M] = np.nan  # a point in the origin has no direction
+        near = range_m < MIN_DEPTH_M  # a point in the origin has no direction
+    points[near], range_m[near] = np.nan, np.nan
     return points, range_m
 
 
@@ -124,12 +125,9 @@ def _parallel_misfit(points: Array, usable: NDArray[np.bool_]) -> float:
 
 def _fit_pinhole(points: Array, range_m: Array) -> tuple[PinholeCamera, float] | None:
     """The camera in the optical frame of the points, and its misfit in pixels."""
-    with np.errstate(invalid="ignore", divide="ignore"):
-        gnomonic = points[..., :2] / points[..., 2:]
-    gnomonic[~(points[..., 2] > 0) | ~np.isfinite(range_m)] = np.nan
     lines = []
     for axis in (0, 1):
-        value = _line_medians(gnomonic[..., axis], axis)
+        value = _line_medians(_gnomonic(_thinned(points, axis))[..., axis], axis)
         known = np.flatnonzero(np.isfinite(value))
         if known.size < LEAST_LINES:
             return None
@@ -138,13 +136,20 @@ def _fit_pinhole(points: Array, range_m: Array) -> tuple[PinholeCamera, float] |
     if not (step_x > 0 and step_y > 0):
         return None
     rows, cols = _samples(np.isfinite(range_m))
-    off_x = np.abs(gnomonic[rows, cols, 0] - x0 - step_x * cols) / step_x
-    off_y = np.abs(gnomonic[rows, cols, 1] - y0 - step_y * rows) / step_y
+    sample = _gnomonic(points[rows, cols])
+    off_x = np.abs(sample[:, 0] - x0 - step_x * cols) / step_x
+    off_y = np.abs(sample[:, 1] - y0 - step_y * rows) / step_y
     try:
         camera = PinholeCamera(*(float(v) for v in (1 / step_x, 1 / step_y, -x0 / step_x, -y0 / step_y)))
     except InputError:
         return None
     return camera, _kept(np.maximum(off_x, off_y))
+
+
+def _gnomonic(points: Array) -> Array:
+    """x/z and y/z of points (..., 3); NaN behind the camera."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(points[..., :2] / np.where(points[..., 2:] > 0, points[..., 2:], np.nan))
 
 
 def _fit_sphere(points: Array, range_m: Array) -> tuple[SphericalRays, float] | None:
@@ -153,9 +158,8 @@ def _fit_sphere(points: Array, range_m: Array) -> tuple[SphericalRays, float] | 
     A row is a cone about the axis: the component of its directions along the axis does not vary. So the axis
     is the direction of least scatter within the rows.
     """
-    directions = points / range_m[..., None]
     rows, cols = _samples(np.isfinite(range_m))
-    sample = directions[rows, cols]
+    sample = points[rows, cols] / range_m[rows, cols, None]
     count = np.bincount(rows, minlength=range_m.shape[0])
     means = np.stack([np.bincount(rows, s, minlength=count.size) for s in sample.T], axis=1)
     within = sample - (means / np.maximum(count, 1)[:, None])[rows]
@@ -167,9 +171,11 @@ def _fit_sphere(points: Array, range_m: Array) -> tuple[SphericalRays, float] | 
         return None
     axes = np.stack([ahead / length, np.cross(axis, ahead / length), axis])
 
-    e1, e2, up = np.moveaxis(directions @ axes.T, -1, 0)
-    elevation = _filled(_line_medians(np.arctan2(up, np.hypot(e1, e2)), 1))
-    azimuth = _filled(_line_medians(np.arctan2(e2, e1), 0))
+    (rows_e1, rows_e2, rows_up), (cols_e1, cols_e2, _) = (
+        np.moveaxis(_thinned(points, axis) @ axes.T, -1, 0) for axis in (1, 0)
+    )
+    elevation = _filled(_line_medians(np.arctan2(rows_up, np.hypot(rows_e1, rows_e2)), 1))
+    azimuth = _filled(_line_medians(np.arctan2(cols_e2, cols_e1), 0))
     if elevation is None or azimuth is None:
         return None
     rays = SphericalRays(axes, elevation, azimuth)
@@ -178,13 +184,14 @@ def _fit_sphere(points: Array, range_m: Array) -> tuple[SphericalRays, float] | 
     return rays, _kept(np.where(np.isfinite(off), off, 1.0))  # beyond the border of the grid
 
 
-def _line_medians(values: Array, axis: int) -> Array:
-    """Median of each column (axis 0) or row (axis 1) of (H, W) values; NaN with fewer than LEAST_PIXELS.
+def _thinned(image: Array, axis: int) -> Array:
+    """About LINE_SAMPLES pixels of each column (axis 0) or row (axis 1) of an image (H, W, ...)."""
+    stride = max(1, image.shape[axis] // LINE_SAMPLES)
+    return image[::stride] if axis == 0 else image[:, ::stride]
 
-    Of long lines about LINE_SAMPLES pixels are looked at.
-    """
-    stride = max(1, values.shape[axis] // LINE_SAMPLES)
-    values = values[::stride] if axis == 0 else values[:, ::stride]
+
+def _line_medians(values: Array, axis: int) -> Array:
+    """Median of each column (axis 0) or row (axis 1) of (H, W) values; NaN with fewer than LEAST_PIXELS."""
     known = np.isfinite(values)
     count = known.sum(axis=axis)
     ordered = np.sort(np.where(known, values, np.inf), axis=axis)

@@ -131,7 +131,10 @@ def _scales(law, values, variance, tolerance2):  # type: ignore[no-untyped-def]
 def uses_inverse_depth(frame: RangeColorFrame, config: SegmenterConfig) -> bool:
     """Which range signal is modelled; a camera is needed for inverse depth."""
     if config.signal.kind == "inverse_depth" and frame.camera is None:
-        raise ConfigError("signal.kind = inverse_depth needs a camera model; this frame has none")
+        raise ConfigError(
+            "signal.kind = inverse_depth needs a camera model or a grid whose rays pass through the origin; "
+            "this frame has neither"
+        )
     return frame.camera is not None and config.signal.kind != "xyz"
 
 

@@ -230,7 +230,7 @@ def test_a_cloud_of_a_camera_needs_no_intrinsics():
 def test_inverse_depth_without_centre_is_refused():
     frame = make_scene("painting", 42, width=120, height=90).frame
     config = SegmenterConfig().replace({"signal.kind": "inverse_depth"})
-    with pytest.raises(ConfigError, match="camera"):
+    with pytest.raises(ConfigError, match="rays"):
         segment(frame, config)
     assert "view" in segment(room_scan(60, 80)[0], config).timings
 
