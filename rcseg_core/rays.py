@@ -5,12 +5,13 @@ coordinates of the ray (section 2 asks for a signal that is polynomial on a plan
 and columns of a scanner it is no polynomial. So it pays to know the rays, and points tell them: the direction
 of a pixel must not depend on its range. Two kinds of grid are known. A depth camera whose intrinsics got
 lost: x/z is affine in the column, y/z in the row. A spherical scanner with any axis: one elevation a row and
-one azimuth a column (spinning lidars, pan-tilt units). Parallel rays (triangulation scanners) fit neither.
+one azimuth a column, or the other way round (spinning lidars, pan-tilt units). Parallel rays (triangulation
+scanners) fit neither.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -43,17 +44,21 @@ class SphericalRays:
         degrees, and the axis (elevation 90 degrees), in the frame of the points
     elevation : (H,) float64, rad, strictly monotonic
     azimuth : (W,) float64, rad, strictly monotonic
+    by_column : bool
+        The columns have the elevations, (W,), and the rows the azimuths, (H,), instead.
     """
 
     axes: Array
     elevation: Array
     azimuth: Array
+    by_column: bool = False
 
     def directions(self) -> Array:
         """(H, W, 3) unit vectors."""
         up, out = np.sin(self.elevation)[:, None, None], np.cos(self.elevation)[:, None, None]
         around = np.cos(self.azimuth)[:, None] * self.axes[0] + np.sin(self.azimuth)[:, None] * self.axes[1]
-        return np.asarray(out * around[None] + up * self.axes[2])
+        directions = np.asarray(out * around[None] + up * self.axes[2])
+        return directions.swapaxes(0, 1) if self.by_column else directions
 
     def locate(self, directions: Array) -> tuple[Array, Array]:
         """Fractional rows and columns of directions (..., 3) of any length; NaN outside of the grid.
@@ -61,8 +66,9 @@ class SphericalRays:
         The grid ends half a step beyond its outermost rays.
         """
         e1, e2, axis = np.moveaxis(directions @ self.axes.T, -1, 0)
-        rows = _index(np.arctan2(axis, np.hypot(e1, e2)), self.elevation)
-        return rows, _index(np.arctan2(e2, e1), self.azimuth)
+        up = _index(np.arctan2(axis, np.hypot(e1, e2)), self.elevation)
+        around = _index(np.arctan2(e2, e1), self.azimuth)
+        return (around, up) if self.by_column else (up, around)
 
 
 def find_rays(frame: RangeColorFrame) -> PinholeCamera | SphericalRays | None:
@@ -79,7 +85,7 @@ def find_rays(frame: RangeColorFrame) -> PinholeCamera | SphericalRays | None:
     if not all(enough):
         return None
     parallel = _parallel_misfit(points, usable)
-    for fit in (_fit_pinhole, _fit_sphere):
+    for fit in (_fit_pinhole, _fit_sphere, _fit_sphere_by_column):
         found = fit(points, range_m)
         if found is None:
             continue
@@ -182,6 +188,12 @@ def _fit_sphere(points: Array, range_m: Array) -> tuple[SphericalRays, float] | 
     at_rows, at_cols = rays.locate(sample)
     off = np.maximum(np.abs(at_rows - rows), np.abs(at_cols - cols))
     return rays, _kept(np.where(np.isfinite(off), off, 1.0))  # beyond the border of the grid
+
+
+def _fit_sphere_by_column(points: Array, range_m: Array) -> tuple[SphericalRays, float] | None:
+    """The spherical grid whose columns are cones about the axis, and its misfit in pixels."""
+    found = _fit_sphere(points.swapaxes(0, 1), range_m.T)
+    return None if found is None else (replace(found[0], by_column=True), found[1])
 
 
 def _thinned(image: Array, axis: int) -> Array:

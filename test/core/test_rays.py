@@ -44,6 +44,15 @@ def test_directions_of_a_spherical_scanner_are_found(axes, elevation, azimuth):
 ROUND = [((s * x, s * y, s * z), 2.0) for x, y, z in ((1, 0, 0.1), (0, 1, 0), (0.1, 0, 1)) for s in (-1, 1)]
 
 
+def test_columns_may_have_the_elevations():
+    frame, _ = room_scan(60, 80)
+    rays, found = find_rays(frame), find_rays(grey(np.ascontiguousarray(frame.points.swapaxes(0, 1))))
+    np.testing.assert_allclose(found.directions(), rays.directions().swapaxes(0, 1), atol=1e-6)
+    rows, cols = found.locate(found.directions())
+    np.testing.assert_allclose(rows, np.arange(80)[:, None] + np.zeros(60), atol=1e-4)
+    np.testing.assert_allclose(cols, np.arange(60)[None] + np.zeros((80, 1)), atol=1e-4)
+
+
 def test_locating_a_direction_is_the_inverse_of_looking_along_it():
     frame, _ = room_scan(60, 80)
     rays = find_rays(frame)

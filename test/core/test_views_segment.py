@@ -152,6 +152,15 @@ def test_a_mirrored_scan_gives_the_mirrored_surfaces(scan, result):
         assert best_overlap(surface, labels, number)[0] > 0.93, number
 
 
+def test_a_scan_stored_by_columns_gives_the_same_surfaces(scan):
+    frame, surface = scan
+    points, color = (np.ascontiguousarray(image.swapaxes(0, 1)) for image in (frame.points, frame.color))
+    result = segment(RangeColorFrame(points, color))
+    assert "view" in result.timings
+    for number in np.unique(surface[surface > 0]):
+        assert best_overlap(surface, result.surface_labels.T, number)[0] > 0.93, number
+
+
 def test_colours_on_a_plane_are_regions_of_one_surface():
     straight = spherical_rays(np.linspace(20, -20, 120), np.linspace(-25, 25, 150))
     range_m = 2.0 / straight[..., 2]
