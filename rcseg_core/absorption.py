@@ -136,20 +136,18 @@ def _refine(image, flags, labels, leaves, models, n_range, law, color_eps2, smoo
     height, width = labels.shape
     moved = 0
     for row in range(first, last):
+        above = max(row - 1, 0)
+        below = min(row + 1, height - 1)
         for col in range(width):
             k = labels[row, col]
-            if k <= 0:
-                continue
-            up = labels[max(row - 1, 0), col]
-            down = labels[min(row + 1, height - 1), col]
-            left = labels[row, max(col - 1, 0)]
             right = labels[row, min(col + 1, width - 1)]
-            if (
-                (up == k or up <= 0)
-                and (down == k or down <= 0)
-                and (left == k or left <= 0)
-                and (right == k or right <= 0)
-            ):
+            left = labels[row, max(col - 1, 0)]
+            up = labels[above, col]
+            down = labels[below, col]
+            # most pixels are inside of their region
+            if (up == k) & (down == k) & (left == k) & (right == k):
+                continue
+            if k <= 0:
                 continue
             best = k
             best_cost = np.inf

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -74,8 +75,10 @@ def segment(
         result = segment(view.frame, config.replace({"reflectance.mode": "none"}))
         return carried_back(view, result, frame, color, config)
     if config.signal.reduction > 1 and min(frame.valid.shape) >= LEAST_SIDE_PX:  # coarse to fine
-        small = segment(reduced(frame, color, config.signal.reduction), unreduced(config))
-        return at_full_size(frame, color, small, config)
+        squares = reduced(frame, color, config.signal.reduction)
+        clock.lap("squares")
+        result = at_full_size(frame, color, segment(squares, unreduced(config)), config)
+        return replace(result, timings=clock.seconds | result.timings)
     signals = build_signals(frame, color, config)
     clock.lap("signals")
     edges = detect_edges(signals, config.edges)

@@ -8,6 +8,7 @@ levels of the full image are computed when they are asked for.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache, partial
@@ -177,6 +178,7 @@ def at_full_size(
     color : (H, W, 3) uint8, the frame's colour after the reflectance stage
     small : Segmentation of ``reduced(frame, config.signal.reduction)``
     """
+    start = time.perf_counter()
     step = config.signal.reduction
     # a pixel has the noise of a mean times the root of the independent pixels in it
     factor = max(step / float(np.sqrt(small.noise.range_correlation)), 1.0)
@@ -198,6 +200,7 @@ def at_full_size(
     relabel(surface_labels, surface_of)
     surfaces = surface_of.astype(np.int64)[: count + 1]
     edges = _enlarged(small.edges, signals.flags, step)
+    range_leaves = None if small.range_leaves is None else _enlarged(small.range_leaves, signals.flags, step)
 
     @cache
     def measured() -> tuple[Signals, Models, Callable[[], Sequence[Region]]]:
@@ -213,12 +216,11 @@ def at_full_size(
         labels=labels,
         surface_labels=surface_labels,
         edges=edges,
+        timings={**small.timings, "full size": time.perf_counter() - start},
         camera=frame.camera,
         measure=lambda: measured()[:2],
         leaves=leaves,
-        range_leaves=None
-        if small.range_leaves is None
-        else _enlarged(small.range_leaves, signals.flags, step),
+        range_leaves=range_leaves,
         nodes=small.nodes[np.concatenate([[0], order])],
         coarsen=partial(_renumbered, small.coarsen, number),
         describe=lambda: measured()[2](),
