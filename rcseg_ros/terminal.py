@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -43,20 +44,10 @@ def prepare(config: SegmenterConfig) -> None:
 
 def run_warmup() -> None:
     """Fill the cache of compiled kernels; tell how far it is, how long it took and where it lies."""
-    start = told = perf_counter()
-    with _PROGRESS.status("compiling", spinner="line") as status:
-
-        def on_case(name: str, done: int, total: int) -> None:
-            nonlocal told
-            number, now = len(compiled()), perf_counter()
-            text = f"{done} of {total} cases, {now - start:.0f} s, {number} kernels compiled; next: {name}"
-            status.update(text)
-            if not _PROGRESS.is_terminal and now - told > LOG_EVERY_S:
-                _PROGRESS.print(text, soft_wrap=True)
-                told = now
-
+    start = perf_counter()
+    with _beats() as at:
         try:
-            kept = fill_cache(on_case)
+            kept = fill_cache(at)
         except KeyboardInterrupt:
             CONSOLE.print(f"{len(compiled())} kernels compiled and kept; the next run goes on from there")
             raise
@@ -65,6 +56,38 @@ def run_warmup() -> None:
     CONSOLE.print(f"{what}, in {seconds:.1f} s")
     CONSOLE.print(f"{kept.megabytes:.1f} MB kept in {kept.folder}", soft_wrap=True)
     CONSOLE.print("They stay until rcseg, Numba or Python is updated, or the processor is another.")
+
+
+@contextmanager
+def _beats() -> Iterator[Callable[[str, int, int], None]]:
+    """Take what comes next in a warm-up, and tell it again and again: one case may take a minute."""
+    start, over = perf_counter(), threading.Event()
+    case = ("", 0, 1)
+
+    def at(*given: Any) -> None:
+        nonlocal case
+        case = given
+
+    def tell() -> None:
+        every_s = 0.5 if _PROGRESS.is_terminal else LOG_EVERY_S
+        while not over.wait(every_s):
+            name, done, total = case
+            text = (
+                f"{name} ({done + 1} of {total}), {perf_counter() - start:.0f} s, {len(compiled())} kernels"
+            )
+            if _PROGRESS.is_terminal:
+                status.update(text)
+            else:
+                _PROGRESS.print(f"compiling: {text}", soft_wrap=True)
+
+    with _PROGRESS.status("compiling", spinner="line") as status:
+        teller = threading.Thread(target=tell, daemon=True)
+        teller.start()
+        try:
+            yield at
+        finally:
+            over.set()
+            teller.join()
 
 
 def run_replay(request: ReplayRequest) -> int:

@@ -20,27 +20,16 @@ from typing import Any
 import numpy as np
 
 from rcseg_core import PinholeCamera, RangeColorFrame, SegmenterConfig, segment
-from rcseg_core.config import PRESETS
+from rcseg_core.config import PRESETS, describe
 from rcseg_core.errors import InputError
 from rcseg_core.jit import cache_folder
 from rcseg_ros.messages import region_array
 
 _PATIENCE_S, _BEAT_S = 3.0, 10.0
-#: Configurations that reach kernels which no preset calls, by what they are for.
-_OTHERS: dict[str, dict[str, Any]] = {
-    "surfaces_first": {"grouping.order": "surfaces_first"},
-    "joint": {"grouping.order": "joint"},
-    "range_only": {"grouping.order": "range_only"},
-    "chow": {"grouping.criterion": "chow", "grouping.edge_gate": False},
-    "bayes": {"grouping.criterion": "bayes"},
-    "lms": {"seeds.fit": "lms"},
-    "region": {"generalization.hypothesis": "region", "generalization.test": "f"},
-    "sensor": {"noise.range_model": "kinect_v1", "noise.color_sigma": 2.0},
-    "constant": {"noise.range_model": "constant"},
-    "active": {"reflectance.mode": "active"},
-    "no absorption": {"absorption.enabled": False},
-    "no outliers": {"edges.outlier_threshold": 0.0},
-}
+#: Numbers that switch something on or off; choices and switches themselves are all tried.
+_NUMBERS = (("edges.outlier_threshold", 0.0), ("noise.color_sigma", 2.0))
+#: Needs a second frame, and calls no kernel.
+_LEFT_OUT = {("reflectance.mode", "calibrated")}
 
 
 @dataclass(frozen=True)
@@ -149,8 +138,13 @@ def _cases() -> Iterator[tuple[str, Callable[[], RangeColorFrame], SegmenterConf
     default = SegmenterConfig()
     for name in PRESETS:
         yield f"preset {name}", _small_scene, SegmenterConfig.preset(name)
-    for name, changes in _OTHERS.items():
-        yield name, _small_scene, default.replace(changes)
+    for parameter in describe(default):
+        values = parameter.choices or ((not parameter.default,) if parameter.type is bool else ())
+        for value in values:
+            if value != parameter.default and (parameter.key, value) not in _LEFT_OUT:
+                yield f"{parameter.key} = {value}", _small_scene, default.replace({parameter.key: value})
+    for key, value in _NUMBERS:
+        yield f"{key} = {value}", _small_scene, default.replace({key: value})
     yield "the paper's own form", _small_scene, SegmenterConfig.literal()
     for order in ("surfaces_first", "joint", "range_only"):
         config = default.replace({"grouping.order": order})
