@@ -19,8 +19,9 @@ from rcseg_core.jit import bare
 from rcseg_core.models import Models, predict
 from rcseg_core.signals import INVALID, MISFIT, RANGE_OUTLIER, Signals
 
-#: Cells of a surface: enough for five parameters and a test, few enough for a dozen fits a frame.
-CELLS = 400
+#: Cells of a surface whose patches are flat, and of others, which a patch follows within small cells only:
+#: enough for five parameters and a test, few enough for a dozen fits a frame.
+FLAT_CELLS, BENT_CELLS = 300, 900
 #: Pixels to a side of a cell that are enough; wider cells leave out rows and columns.
 CELL_PX = 6
 #: Cells that the box of one surface may be cut into, most of them empty on thin or branched surfaces.
@@ -95,8 +96,9 @@ def _on_rim(surfaces, row, col, margin):  # type: ignore[no-untyped-def]
 
 
 @bare
-def _extent(surfaces, flags, margin, count, core, box):  # type: ignore[no-untyped-def]
-    """Usable pixels of each surface, those off its rim, and its box (row_min, col_min, row_max, col_max)."""
+def _extent(labels, surfaces, flags, degree, margin, count, core, bent, box):  # type: ignore[no-untyped-def]
+    """Usable pixels of each surface, those off its rim, whether a patch of it has a degree (N + 1,) above 1,
+    and its box (row_min, col_min, row_max, col_max)."""
     height, width = surfaces.shape
     for row in range(height):
         for col in range(width):
@@ -104,6 +106,7 @@ def _extent(surfaces, flags, margin, count, core, box):  # type: ignore[no-untyp
             if s <= 0 or flags[row, col] & UNUSABLE:
                 continue
             count[s] += 1
+            bent[s] |= degree[labels[row, col]] > 1
             core[s] += not _on_rim(surfaces, row, col, margin)
             box[s, 0] = min(box[s, 0], row)
             box[s, 1] = min(box[s, 1], col)
@@ -158,15 +161,20 @@ def _evaluate(models, owner, sums, n_range, out):  # type: ignore[no-untyped-def
             )
 
 
-def _layout(surfaces: NDArray[np.int32], flags: NDArray[np.uint8], correlation: float) -> _Layout:
-    """Cells no smaller than one independent measurement, about CELLS a surface."""
+def _layout(
+    labels: NDArray[np.int32], surfaces: NDArray[np.int32], flags: NDArray[np.uint8],
+    degree: NDArray[np.int64], correlation: float,
+) -> _Layout:  # fmt: skip
+    """Cells no smaller than one independent measurement, some hundreds a surface."""
     last = int(surfaces.max(initial=0))
     count, core = np.zeros(last + 1, np.int64), np.zeros(last + 1, np.int64)
     box = np.tile(np.array([surfaces.shape[0], surfaces.shape[1], -1, -1]), (last + 1, 1))
-    _extent(surfaces, flags, MARGIN_PX, count, core, box)
+    bent = np.zeros(last + 1, np.bool_)
+    _extent(labels, surfaces, flags, degree, MARGIN_PX, count, core, bent, box)
     used = np.where(core >= LEAST_CORE * count, core, count)
+    wanted = np.where(bent, BENT_CELLS, FLAT_CELLS)
     size = np.maximum(box[:, 2:] - box[:, :2] + 1, 1)
-    pitch = np.ceil(np.sqrt(np.maximum(used / CELLS, size.prod(axis=1) / MOST_CELLS))).astype(np.int64)
+    pitch = np.ceil(np.sqrt(np.maximum(used / wanted, size.prod(axis=1) / MOST_CELLS))).astype(np.int64)
     pitch = np.maximum(pitch, int(np.ceil(np.sqrt(correlation))))
     pitch[count == 0] = 0
     cells = -(-size // np.maximum(pitch, 1)[:, None])
@@ -196,7 +204,8 @@ def gather_cells(
     """
     n = signals.n_range
     correlation = signals.noise.range_correlation
-    layout = _layout(surfaces, signals.flags, correlation)
+    degree = np.ascontiguousarray(models.degree[:, 0])
+    layout = _layout(labels, surfaces, signals.flags, degree, correlation)
     owner, sums = np.zeros(layout.first[-1], np.int64), np.zeros((layout.first[-1], 4 + n))
     _gather(labels, surfaces, signals.image, signals.flags, n, models, layout, owner, sums)
     kept = np.flatnonzero(owner)

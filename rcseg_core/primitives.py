@@ -9,7 +9,7 @@ noncentral one. The simplest primitive that passes is taken; when none does, the
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,9 +31,11 @@ from rcseg_core.shapes import (
 
 Array = NDArray[np.float64]
 
-#: Share of sigma, and of the tolerance, that a plane and a curved shape may miss a surface by (rms). Sensors
-#: bend planes: floor, lid and box of a Kinect recording are 0.0016 to 0.0022 of their depth off.
-ALLOWED_FLAT, ALLOWED_CURVED = 0.75, 0.25
+#: Share of sigma, and of the tolerance, that a shape may miss a surface by (rms).
+ALLOWED = 0.25
+#: The same for a plane where no curved shape fits. Sensors bend planes: floor, lid and box of a Kinect
+#: recording are 0.0016 to 0.0022 of their depth off.
+ALLOWED_BENT = 0.75
 #: P of the test below which a primitive is rejected.
 LEAST_P = 0.01
 #: Normals must turn by this angle over the surface, or its curvature is not seen; rad.
@@ -95,9 +97,8 @@ class Primitive:
 NONE = Primitive("none", {}, np.empty((0, 0)), True, np.nan, np.nan, np.nan, np.nan, np.nan)
 
 
-def allowed(cells: Cells, kind: int) -> Array:
-    """(m,) squared misfit that a shape of this kind may have, over the variance of each cell."""
-    share = ALLOWED_FLAT if kind == PLANE else ALLOWED_CURVED
+def allowed(cells: Cells, share: float) -> Array:
+    """(m,) squared misfit that is allowed, over the variance of each cell; share of sigma and tolerance."""
     return np.asarray(cells.worth * share**2 * (1.0 + cells.tolerance2))
 
 
@@ -105,7 +106,7 @@ def fit(start: Shape | None, cells: Cells) -> Primitive | None:
     """The least-squares shape next to a first guess; None without one, or where the cells do not tell it."""
     if start is None:
         return None
-    limit = CLIP * np.sqrt(1.0 + allowed(cells, start.kind))
+    limit = CLIP * np.sqrt(1.0 + allowed(cells, ALLOWED))
     found = fit_shape(start, cells.points, cells.spread, limit)
     return None if found is None else assess(*found, cells)
 
@@ -133,9 +134,8 @@ def assess(shape: Shape, covariance: Array, cells: Cells) -> Primitive:
     cells : those it was fitted to
     """
     miss = residuals(shape, cells.points, cells.spread)
-    excess = allowed(cells, shape.kind)
     freedom = max(len(miss.whitened) - len(covariance), 1)
-    chi2 = float(np.sum(np.minimum(miss.whitened**2, CLIP**2 * (1.0 + excess))))
+    chi2, p_value = _test(miss.whitened, freedom, allowed(cells, ALLOWED))
     share = cells.pixels / cells.pixels.sum()
     # a pixel misses the mean of its cell by noise; the mean misses the shape by less noise, and by misfit
     cell_variance = miss.sigma**2
@@ -152,9 +152,24 @@ def assess(shape: Shape, covariance: Array, cells: Cells) -> Primitive:
         rms_m=float(np.sqrt(share @ (beyond * pixel_variance + missed))),
         rms_sigma=float(np.sqrt(share @ (beyond + missed / pixel_variance))),
         misfit_m=float(np.sqrt(max(misfit2, 0.0))),
-        p_value=noncentral_p(chi2, freedom, float(excess.sum())),
+        p_value=p_value,
         arc=turn(miss.gradients),
     )
+
+
+def _test(whitened: Array, freedom: int, excess: Array) -> tuple[float, float]:
+    """Chi-squared of the cells, outliers clipped, and its P under an allowed misfit (m,)."""
+    chi2 = float(np.sum(np.minimum(whitened**2, CLIP**2 * (1.0 + excess))))
+    return chi2, noncentral_p(chi2, freedom, float(excess.sum()))
+
+
+def _as_bent(plane: Primitive, cells: Cells) -> Primitive:
+    """The plane with its P under the misfit that is allowed where no curved shape fits."""
+    normal = plane.parameters["normal"]
+    point = normal * plane.parameters["distance"]
+    miss = residuals(Shape(PLANE, point, normal, 0.0, point), cells.points, cells.spread)
+    p_value = _test(miss.whitened, max(len(miss.whitened) - 3, 1), allowed(cells, ALLOWED_BENT))[1]
+    return replace(plane, p_value=p_value)
 
 
 def recognise(cells: Cells) -> tuple[Primitive, tuple[Primitive, ...]]:
@@ -162,7 +177,8 @@ def recognise(cells: Cells) -> tuple[Primitive, tuple[Primitive, ...]]:
 
     Returns
     -------
-    primitive : the simplest that passes the test and is known well enough, or `NONE`
+    primitive : the simplest that passes the test and is known well enough; where none does, the plane if it
+        is only bent as sensors bend planes; else `NONE`
     candidates : the plane, and where it fails the sphere and the cylinder, as fitted
     """
     if len(cells.points) < LEAST_CELLS or cells.worth.sum() < LEAST_CELLS:
@@ -175,8 +191,14 @@ def recognise(cells: Cells) -> tuple[Primitive, tuple[Primitive, ...]]:
     starts = start_sphere(seen.points, weight), start_cylinder(seen.points, seen.normals, weight)
     curved = [c for c in (fit(start, seen) for start in starts) if c is not None]
     adequate = [c for c in curved if c.p_value >= LEAST_P and c.arc >= LEAST_ARC and is_known(c)]
-    best = min(adequate, key=lambda c: c.misfit_m, default=NONE)
-    return best, tuple(c for c in (plane, *curved) if c is not None)
+    candidates = tuple(c for c in (plane, *curved) if c is not None)
+    if adequate:
+        return min(adequate, key=lambda c: c.misfit_m), candidates
+    if plane is not None:
+        bent = _as_bent(plane, cells)
+        if bent.p_value >= LEAST_P and is_known(bent):
+            return bent, candidates
+    return NONE, candidates
 
 
 def without_limb(cells: Cells) -> Cells:

@@ -43,7 +43,8 @@ class Shape(NamedTuple):
 
 
 class Residuals(NamedTuple):
-    """Of m cells: signed distance over its noise, the noise in m, gradients of the distance (m, 3)."""
+    """Of m cells: distance along the way of the noise over its noise, the noise as a distance from the shape
+    in m, gradients of the distance (m, 3)."""
 
     whitened: Array
     sigma: Array
@@ -71,51 +72,80 @@ def _complete(direction, frame):  # type: ignore[no-untyped-def]
 
 
 @bare
-def _miss(kind, vector, frame, point, spread, row, gradient):  # type: ignore[no-untyped-def]
-    """Whitened distance of one point and its noise; derivatives into row (q,), gradient (3,)."""
-    x = point[0] - vector[0]
-    y = point[1] - vector[1]
-    z = point[2] - vector[2]
+def _distance(kind, vector, x, y, z, gradient):  # type: ignore[no-untyped-def]
+    """Signed distance of a point from a shape and its height along the direction; gradient (3,) : out."""
+    x -= vector[0]
+    y -= vector[1]
+    z -= vector[2]
     along = x * vector[3] + y * vector[4] + z * vector[5]
     if kind == PLANE:
-        distance = along
-        nx, ny, nz = vector[3], vector[4], vector[5]
+        gradient[0], gradient[1], gradient[2] = vector[3], vector[4], vector[5]
+        return along, along
+    if kind == CYLINDER:
+        x -= along * vector[3]
+        y -= along * vector[4]
+        z -= along * vector[5]
+    length = max(np.sqrt(x * x + y * y + z * z), 1e-12)
+    gradient[0], gradient[1], gradient[2] = x / length, y / length, z / length
+    return length - vector[6], along
+
+
+@bare
+def _miss(kind, vector, frame, point, spread, row, gradient):  # type: ignore[no-untyped-def]
+    """Whitened distance of one point and its noise; derivatives into row (q,), gradient (3,).
+
+    The distance is that along the way which the noise goes, a straight line to the surface; its noise and its
+    derivatives are taken where it ends: at the point itself they would depend on the noise, and a radius
+    would come out too small.
+    """
+    x, y, z = point[0], point[1], point[2]
+    whitened = 0.0
+    sigma = 0.0
+    for step in range(1 if kind == PLANE else 2):
+        distance, along = _distance(kind, vector, x, y, z, gradient)
+        variance = 0.0
+        whole = 0.0
+        mx, my, mz = 0.0, 0.0, 0.0
+        for j in range(3):
+            part = gradient[0] * spread[0, j] + gradient[1] * spread[1, j] + gradient[2] * spread[2, j]
+            variance += part * part
+            whole += spread[0, j] ** 2 + spread[1, j] ** 2 + spread[2, j] ** 2
+            mx += spread[0, j] * part
+            my += spread[1, j] * part
+            mz += spread[2, j] * part
+        # along a ray that only grazes the shape, a pixel's own width counts
+        variance = max(variance, GRAZING2 * whole)
+        sigma = np.sqrt(variance)
+        whitened += distance / sigma
+        if step == 0 and kind != PLANE:
+            share = distance / variance
+            far = abs(share) * np.sqrt(mx * mx + my * my + mz * mz)
+            if far > 0.5 * vector[6]:  # nowhere near: the straight line says nothing
+                share *= 0.5 * vector[6] / far
+            x -= share * mx
+            y -= share * my
+            z -= share * mz
+    if kind == PLANE:
+        x -= vector[0]
+        y -= vector[1]
+        z -= vector[2]
         row[0] = x * frame[0, 0] + y * frame[0, 1] + z * frame[0, 2]
         row[1] = x * frame[1, 0] + y * frame[1, 1] + z * frame[1, 2]
         row[2] = -1.0
+    elif kind == SPHERE:
+        row[0] = -gradient[0]
+        row[1] = -gradient[1]
+        row[2] = -gradient[2]
+        row[3] = -1.0
     else:
-        if kind == CYLINDER:
-            x -= along * vector[3]
-            y -= along * vector[4]
-            z -= along * vector[5]
-        length = max(np.sqrt(x * x + y * y + z * z), 1e-12)
-        distance = length - vector[6]
-        nx, ny, nz = x / length, y / length, z / length
-        if kind == SPHERE:
-            row[0] = -nx
-            row[1] = -ny
-            row[2] = -nz
-            row[3] = -1.0
-        else:
-            # an axis a -> a + t e moves the foot of x by t (a . (x - p)) e, across the axis
-            for j in range(2):
-                row[j] = -(nx * frame[j, 0] + ny * frame[j, 1] + nz * frame[j, 2])
-                row[2 + j] = along * row[j]
-            row[4] = -1.0
-    gradient[0] = nx
-    gradient[1] = ny
-    gradient[2] = nz
-    variance = 0.0
-    whole = 0.0
-    for j in range(3):
-        part = nx * spread[0, j] + ny * spread[1, j] + nz * spread[2, j]
-        variance += part * part
-        whole += spread[0, j] ** 2 + spread[1, j] ** 2 + spread[2, j] ** 2
-    # along a ray that only grazes the shape, a pixel's own width counts
-    sigma = np.sqrt(max(variance, GRAZING2 * whole))
+        # an axis a -> a + t e moves the foot of x by t (a . (x - p)) e, across the axis
+        for j in range(2):
+            row[j] = -(gradient[0] * frame[j, 0] + gradient[1] * frame[j, 1] + gradient[2] * frame[j, 2])
+            row[2 + j] = along * row[j]
+        row[4] = -1.0
     for j in range(FREEDOM[kind]):
         row[j] /= sigma
-    return distance / sigma, sigma
+    return whitened, sigma
 
 
 @bare

@@ -131,9 +131,10 @@ def test_scenes_are_recognised_to_a_fraction_of_the_noise(family, seeds):
         for kind, found, mask, scene in recognised(family, seed):
             assert found.kind == kind, (seed, kind, found)
             kinds.add(kind)
-            # 600 pixels and more tell where the surface is to a fifth of one pixel's noise
+            # 2000 pixels and more tell where the surface is to a fifth of one pixel's noise
             sigma = np.median(scene.sigma_range[mask])
-            assert np.sqrt(np.mean(misses(scene, mask, found) ** 2)) < 0.2 * sigma, (seed, kind)
+            least = 0.2 if mask.sum() >= 2000 else 0.5
+            assert np.sqrt(np.mean(misses(scene, mask, found) ** 2)) < least * sigma, (seed, kind)
             assert 0.85 < found.rms_sigma < 1.35 and found.p_value > 0.01
     assert kinds == {"curved": {"plane", "sphere", "cylinder"}, "room": {"plane", "sphere", "cylinder"},
                      "blocks": {"plane"}}[family]  # fmt: skip
@@ -155,8 +156,8 @@ def test_radii_err_as_much_as_they_say():
             exact, _ = fit_shape(start, points, spread, np.full(len(points), 1e9))
             scores.append((found.parameters["radius"] - exact.radius) / found.standard_errors["radius"])
     assert len(scores) >= 15
-    assert 0.6 < np.sqrt(np.mean(np.square(scores))) < 1.6, np.round(scores, 1)
-    assert abs(np.mean(scores)) < 0.8, "no radius is biased"
+    assert 0.6 < np.sqrt(np.mean(np.square(scores))) < 1.5, np.round(scores, 1)
+    assert abs(np.mean(scores)) < 0.5, "no radius is biased"
 
 
 def test_balls_on_a_scanner_grid():
@@ -205,7 +206,7 @@ def test_cells_lie_on_the_surface_and_count_every_pixel_once(camera):
     surface = result.surface_labels[120, 160]
     cells = gather_cells(result.labels, result.surface_labels, result.signals, result.models, frame.camera)
     own = cells[surface - 1]
-    assert len(own.points) <= 600
+    assert len(own.points) <= 1300
     assert own.pixels.sum() <= (result.surface_labels == surface).sum()
     assert own.pixels.sum() > 0.8 * (result.surface_labels == surface).sum()
     off = np.linalg.norm(own.points - (0, 0, 1.2), axis=1) - 0.2

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from oracle.naive_primitives import distance, numeric_table
+from oracle.naive_primitives import along, distance, numeric_table
 from scipy.stats import ncx2
 
 from rcseg_core.cells import Cells
@@ -66,15 +66,29 @@ def seen_cells(kind, rng, count=200, sigma=2e-3, noise=True):
 
 
 @pytest.mark.parametrize("kind", SHAPES)
-def test_distances_and_derivatives_are_those_of_their_definition(kind):
+def test_distances_go_along_the_noise_to_the_shape(kind):
     rng = np.random.default_rng(1)
     cells = seen_cells(kind, rng, 30, sigma=5e-3)
     shape = SHAPES[kind]
     miss = residuals(shape, cells.points, cells.spread)
-    wanted = np.array([distance(kind, shape, p) for p in cells.points])
-    np.testing.assert_allclose(miss.whitened * miss.sigma, wanted, atol=1e-12)
-    along = np.einsum("mi,mij->mj", miss.gradients, cells.spread)
-    np.testing.assert_allclose(miss.sigma, np.linalg.norm(along, axis=1), rtol=1e-9)
+    rays = cells.spread[:, :, 0] / 5e-3
+    way = np.array([along(kind, shape, p, r) for p, r in zip(cells.points, rays, strict=True)])
+    # the gradient's side is outside, the ray's is away from the sensor
+    sign = np.sign(np.sum(miss.gradients * rays, axis=1))
+    np.testing.assert_allclose(miss.whitened, sign * way / 5e-3, atol=0.02)
+    ends = cells.points - way[:, None] * rays
+    assert np.abs([distance(kind, shape, end) for end in ends]).max() < 1e-12
+    slant = np.abs(np.sum(miss.gradients * rays, axis=1))
+    np.testing.assert_allclose(miss.sigma, 5e-3 * slant, rtol=1e-9)
+
+
+def test_noise_on_all_sides_makes_it_the_shortest_way():
+    rng = np.random.default_rng(1)
+    cells = seen_cells("sphere", rng, 30, sigma=5e-3)
+    miss = residuals(SHAPES["sphere"], cells.points, np.tile(2e-3 * np.eye(3), (30, 1, 1)))
+    wanted = np.array([distance("sphere", SHAPES["sphere"], p) for p in cells.points])
+    np.testing.assert_allclose(miss.whitened, wanted / 2e-3, atol=1e-9)
+    np.testing.assert_allclose(miss.sigma, 2e-3)
 
 
 @pytest.mark.parametrize("kind", SHAPES)

@@ -22,6 +22,23 @@ def distance(kind, shape, point):
     return math.sqrt(max(_dot(local, local) - along * along, 0.0)) - shape.radius
 
 
+def along(kind, shape, point, direction):
+    """How far a point (3,) is beyond the shape along a direction (3,), by bisection near the point."""
+
+    def off(t):
+        return distance(kind, shape, [p - t * d for p, d in zip(point, direction, strict=True)])
+
+    low, high = -0.03, 0.03
+    assert off(low) * off(high) <= 0, "the shape is not near"
+    for _ in range(80):
+        middle = 0.5 * (low + high)
+        if off(low) * off(middle) <= 0:
+            high = middle
+        else:
+            low = middle
+    return 0.5 * (low + high)
+
+
 def _basis(direction):
     """Two directions across `direction`, as the product chooses them: by its smallest component."""
     least = min(range(3), key=lambda i: abs(direction[i]))
