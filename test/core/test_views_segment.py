@@ -10,6 +10,7 @@ from rcseg_core.errors import ConfigError
 from rcseg_core.evaluation import evaluate_labels
 from rcseg_core.reflectance import normalize_reflectance
 from rcseg_core.synthetic import make_scene
+from rcseg_core.views import pinhole_view
 
 XYZ = SegmenterConfig().replace({"signal.kind": "xyz"})
 LIDAR = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # x ahead, y left, z up
@@ -111,6 +112,23 @@ def test_levels_only_join_and_the_tree_holds_every_region(result):
             assert np.unique(pairs[0]).size == pairs.shape[1]
         finer = coarser
     assert result.labels_at(0).max() > labels.max() > result.labels_at(1000).max()
+
+
+def test_levels_of_the_grid_are_those_of_its_view():
+    frame, _ = room_scan(200, 250, planes=HALL, boxes=SMALL_BOXES, ball=None, sigma=0.004)
+    result = segment(frame)
+    back = pinhole_view(frame, frame.color, SegmenterConfig()).back
+    renumbered = np.unique(np.stack([result.labels, result.view.labels.ravel()[back]]).reshape(2, -1), axis=1)
+    assert (renumbered[0] != renumbered[1]).any(), "the scene must number its regions anew"
+    top = result.tree.cut(1.0)[result.leaves]
+    for region in result.regions:  # most pixels of a region came with leaves below its node
+        inside = result.labels == region.label
+        assert np.bincount(top[inside]).argmax() == result.nodes[region.label]
+    for level in (0.3, 1.5, 4, 20):
+        here, there = result.labels_at(level), result.view.labels_at(level).ravel()[back]
+        assert 1 < here.max() == np.unique(there).size
+        pairs = np.unique(np.stack([here, there]).reshape(2, -1), axis=1)
+        assert pairs.shape[1] == here.max(), level
 
 
 def test_levels_are_lengths_at_the_median_depth(scan, result):
@@ -241,7 +259,8 @@ def test_inverse_depth_without_centre_is_refused():
     config = SegmenterConfig().replace({"signal.kind": "inverse_depth"})
     with pytest.raises(ConfigError, match="rays"):
         segment(frame, config)
-    assert "view" in segment(room_scan(60, 80)[0], config).timings
+    result = segment(room_scan(60, 80)[0], config)
+    assert "view" in result.timings and result.regions[0].range_patch.kind == "xyz"
 
 
 def test_planes_of_a_recorded_benchmark(shared_data):
