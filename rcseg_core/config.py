@@ -206,7 +206,13 @@ class GroupingConfig:
     edge_gate: bool = _param(
         True, "scale the tolerance by the share of the common boundary that crosses no detected edge"
     )
-    max_gap: int = _param(3, "regions at most this far apart are adjacent", unit="px", low=1, high=15)
+    max_gap: int = _param(
+        3,
+        "regions at most this far apart are adjacent: missing pixels up to this width do not part a surface",
+        unit="px",
+        low=1,
+        high=15,
+    )
     prior_beta: float = _param(
         1.0, "strength of the belief in the coefficients, for criterion bayes", unit="sigma",
         low=1e-6, high=1e6, symbol="beta",
@@ -270,6 +276,16 @@ class BordersConfig:
     reach: int = _param(
         4, "borders at most this far from the intersection move to it", unit="px", low=1, high=50
     )
+    flying: Literal["color", "nearest", "unassigned"] = _param(
+        "color",
+        "pixels in mid-air at a step of depth; color: join the side that has their colour; nearest: the side "
+        "that is nearer to their range; unassigned: none (label 0)",
+        choices=("color", "nearest", "unassigned"),
+    )
+    fill_holes_px: int = _param(
+        0, "holes of up to this area that one surface surrounds get its label, and depth from its model",
+        unit="px", low=0, high=1000000,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -367,6 +383,7 @@ class SegmenterConfig:
                 "generalization.hypothesis": "region",
                 "generalization.test": "f",
                 "borders.sharpen": False,
+                "borders.flying": "nearest",
             }
         )
 

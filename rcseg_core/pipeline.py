@@ -24,10 +24,12 @@ from rcseg_core.stages import (
     absorb_points,
     absorb_small,
     coarser_merges,
+    fill_small_holes,
     final_models,
     group_pass,
     link_signals,
     settle,
+    settle_flying,
     sharpen_borders,
     top_degree,
 )
@@ -98,6 +100,10 @@ def segment(
         partition = partition_by(signals.color_only(), edges, config, within, clock, "color")
         if config.absorption.enabled:
             link_signals(partition, surfaces, signals, edges, config)
+    elif config.absorption.enabled:
+        seen = signals if surfaces is None else signals.range_only()
+        settle_flying(partition, final_models(partition, seen, config)[1], seen, config)
+    fill_small_holes(partition, surfaces, config)
     return conclude(frame, signals, edges, partition, surfaces, config, clock)
 
 

@@ -9,6 +9,7 @@ from rcseg_core.adjacency import Pairs
 from rcseg_core.borders import Sides, sharpen
 from rcseg_core.config import SegmenterConfig
 from rcseg_core.continuity import continuous_pairs
+from rcseg_core.gaps import fill_holes, treat_flying
 from rcseg_core.generalization import choose_degrees, residuals_by_degree
 from rcseg_core.grouping import Grouped, add_merged, group
 from rcseg_core.models import Models, fit_models
@@ -185,6 +186,7 @@ def link_signals(
     partition.forget()
     models = settle(partition, signals, config)
     sharpen_borders(partition, surfaces, models, signals, edges, config)
+    settle_flying(partition, models, signals, config)
     absorb_small(partition, signals, edges, config)
 
 
@@ -207,6 +209,22 @@ def sharpen_borders(
     doubt = config.grouping.noise_share**2 + terms / independent
     sides = Sides(majority(partition, surfaces), models, doubt)
     if sharpen(signals, edges, partition.labels, partition.leaves, sides, regions, config.borders.reach):
+        partition.pixels_changed()
+
+
+def settle_flying(partition: Partition, regions: Models, signals: Signals, config: SegmenterConfig) -> None:
+    """Decide on pixels in mid-air between two surfaces; `regions` are models of `partition`."""
+    mode = config.borders.flying
+    if mode != "nearest" and treat_flying(signals, partition.labels, partition.leaves, regions, mode):
+        partition.pixels_changed()
+
+
+def fill_small_holes(partition: Partition, surfaces: Partition | None, config: SegmenterConfig) -> None:
+    """Label holes that one surface surrounds; without `surfaces`, one region."""
+    if config.borders.fill_holes_px == 0:
+        return
+    surface_of = np.arange(partition.count + 1) if surfaces is None else majority(partition, surfaces)
+    if fill_holes(partition.labels, partition.leaves, surface_of, config.borders.fill_holes_px):
         partition.pixels_changed()
 
 

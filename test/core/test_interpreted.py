@@ -15,7 +15,7 @@ from rcseg_core.synthetic import make_scene
 #: Tests of kernels on small arrays; those of whole frames would take minutes without the compiler.
 KERNEL_TESTS = (
     "moments", "planes", "adjacency", "evidence", "grouping", "models", "continuity", "hierarchy", "cleaning",
-    "generalization", "partition", "rendering", "shapes", "extents", "borders",
+    "generalization", "partition", "rendering", "shapes", "extents", "borders", "gaps",
     "views",
 )  # fmt: skip
 SLOW = (

@@ -153,6 +153,7 @@ CHANGES = {
     "generalization.hypothesis": ("region",),
     "generalization.test": ("f",),
     "borders.sharpen": (False,),
+    "borders.flying": ("nearest", "unassigned"),
 }
 
 
