@@ -20,7 +20,7 @@ KERNEL_TESTS = (
 )  # fmt: skip
 SLOW = (
     "vga or noise_alone or null_hypothesis or pure_noise or many_small or as_large_as_they_say or "
-    "creases_of_scenes"
+    "creases_of_scenes or filled_holes_take or missing_columns"
 )
 
 interpreted = pytest.mark.skipif(
