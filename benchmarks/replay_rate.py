@@ -177,6 +177,8 @@ def itemize(bag: Path, config: SegmenterConfig, outputs: tuple[str, ...], folder
             result = timed("segment()", partial(segment, frame, config))
             timed("regions: patches", partial(getattr, result, "regions"))
             timed("merge tree", partial(getattr, result, "hierarchy"))
+            if "regions" in outputs:
+                timed("surfaces: shapes", partial(getattr, result, "surfaces"))
             timed("metrics", partial(frame_row, header, 0, frame, result, 0.0))
             messages = ResultMessages(header, frame, result, make_message)
             for name in outputs:
