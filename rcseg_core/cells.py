@@ -54,7 +54,8 @@ class Cells:
     ----------
     points : (m, 3) float64, m, camera or scanner frame
     normals : (m, 3) float64, unit normals of the region's patch there; the side is arbitrary
-    spread : (m, 3, 3) float64, square roots of the noise: a cell's error is ``spread @ e``, e white and unit
+    spread : (m, 3, k) float64, square roots of the noise: a cell's error is ``spread @ e``, e (k,) white and
+        unit; k = 1 for cameras, whose noise goes along the ray, 3 for scanner grids
     pixels : (m,) float64, pixels of each cell
     worth : (m,) float64, independent measurements among them
     tolerance2 : (m,) float64, squared approximation limit over the variance of one pixel's noise
@@ -268,6 +269,5 @@ def _from_inverse_depth(
     # tangent plane m.X = 1 with X = ray / w, so w = m.ray: linear in the pixel coordinates
     mx, my = slopes[:, 1] * camera.fx, slopes[:, 0] * camera.fy
     normals = np.stack([mx, my, w - mx * rays[:, 0] - my * rays[:, 1]], axis=1)
-    spread = np.zeros((len(w), 3, 3))
-    spread[:, :, 0] = points * (sigma_w / ahead)[:, None]  # dX = -X dw / w
-    return points, normals, spread
+    spread = points * (sigma_w / ahead)[:, None]  # dX = -X dw / w
+    return points, normals, spread[:, :, None]

@@ -15,7 +15,6 @@ from rcseg_core.frame import PinholeCamera
 from rcseg_core.grouping import Grouped
 from rcseg_core.hierarchy import Hierarchy, Scale, TreeBuilder, join_heights
 from rcseg_core.models import Models
-from rcseg_core.moments import region_boxes
 from rcseg_core.noise import NoiseModel
 from rcseg_core.primitives import Primitive, recognise
 from rcseg_core.rendering import render
@@ -170,15 +169,16 @@ class Segmentation:
     def surfaces(self) -> Sequence[Surface]:
         """All surfaces, ``surfaces[i].label == i + 1``, with the primitives they are; found on first use."""
         cells = gather_cells(self.labels, self.surface_labels, self.signals, self.models, self.camera)
-        sizes = np.bincount(self.surface_labels.ravel(), minlength=len(cells) + 1)
-        regions: list[list[int]] = [[] for _ in range(len(cells) + 1)]
+        parts: list[list[Region]] = [[] for _ in range(len(cells) + 1)]
         for region in self.regions:
-            regions[region.surface].append(region.label)
-        boxes = region_boxes(self.surface_labels, len(cells)).tolist()
-        return [
-            Surface(s, int(sizes[s]), tuple(boxes[s]), tuple(regions[s]), *recognise(part))
-            for s, part in enumerate(cells, start=1)
-        ]
+            parts[region.surface].append(region)
+        surfaces = []
+        for s, part in enumerate(cells, start=1):
+            rows_0, cols_0, rows_1, cols_1 = zip(*(region.box for region in parts[s]), strict=True)
+            box = min(rows_0), min(cols_0), max(rows_1), max(cols_1)
+            pixels = sum(region.pixel_count for region in parts[s])
+            surfaces.append(Surface(s, pixels, box, tuple(r.label for r in parts[s]), *recognise(part)))
+        return surfaces
 
     @cached_property
     def hierarchy(self) -> Hierarchy:

@@ -21,7 +21,7 @@ KINDS = ("plane", "sphere", "cylinder")
 FREEDOM = (3, 4, 5)
 #: Least squared cosine of incidence that a weight is computed with.
 GRAZING2 = 0.01
-STEPS = 30
+STEPS = 15
 
 
 class Shape(NamedTuple):
@@ -106,7 +106,7 @@ def _miss(kind, vector, frame, point, spread, row, gradient):  # type: ignore[no
         variance = 0.0
         whole = 0.0
         mx, my, mz = 0.0, 0.0, 0.0
-        for j in range(3):
+        for j in range(spread.shape[1]):
             part = gradient[0] * spread[0, j] + gradient[1] * spread[1, j] + gradient[2] * spread[2, j]
             variance += part * part
             whole += spread[0, j] ** 2 + spread[1, j] ** 2 + spread[2, j] ** 2
@@ -298,7 +298,8 @@ def residuals(shape: Shape, points: Array, spread: Array) -> Residuals:
     Parameters
     ----------
     points : (m, 3) float64, m
-    spread : (m, 3, 3) float64, the error of a point is ``spread @ e`` with e white and unit
+    spread : (m, 3, k) float64, the error of a point is ``spread @ e`` with e (k,) white and unit; k = 1 for
+        noise along a ray, 3 otherwise
     """
     m = len(points)
     out = Residuals(np.empty(m), np.empty(m), np.empty((m, 3)))
