@@ -16,7 +16,7 @@ from rcseg_core.jit import bare
 from rcseg_core.models import Models, fit_models
 from rcseg_core.moments import UNIT_PX, accumulate, region_boxes
 from rcseg_core.parallel import over_bands
-from rcseg_core.signals import Signals
+from rcseg_core.signals import INVALID, MISFIT, Signals
 
 #: Share of a surface that one model must predict, and its least pixels in every ROW_STEP-th row.
 MIN_PLAIN, LEAST_PLAIN, ROW_STEP = 0.8, 100, 4
@@ -26,7 +26,8 @@ LEAST_PART = 19 * 19
 
 @bare
 def _predicted(image, usable, within, center, coef, accepted, limit, first, last, out):  # type: ignore[no-untyped-def]
-    """Rows of out: 1 where the plane of an accepted surface predicts a usable pixel within `limit`.
+    """Rows of out: 1 where the plane of an accepted surface predicts a usable pixel within `limit`, 2 where a
+    pixel was not measured, else 0.
 
     center (N + 1, 2), coef (N + 1, 3, 3): planes value, slope in x, slope in y; limit : squared distance
     """
@@ -35,6 +36,8 @@ def _predicted(image, usable, within, center, coef, accepted, limit, first, last
             k = within[row, col]
             out[row, col] = 0
             if k <= 0 or not accepted[k] or usable[row, col] != 0:
+                if k > 0 and accepted[k] and usable[row, col] == INVALID:
+                    out[row, col] = 2
                 continue
             x = (col - center[k, 0]) / UNIT_PX
             y = (row - center[k, 1]) / UNIT_PX
@@ -43,6 +46,14 @@ def _predicted(image, usable, within, center, coef, accepted, limit, first, last
                 d = image[row, col, c] - coef[k, c, 0] - coef[k, c, 1] * x - coef[k, c, 2] * y
                 far += d * d
             out[row, col] = far <= limit
+
+
+@bare
+def _number(seeds, number, plain):  # type: ignore[no-untyped-def]
+    """New numbers, 0 on pixels that only hang the others together."""
+    for row in range(seeds.shape[0]):
+        for col in range(seeds.shape[1]):
+            seeds[row, col] = number[seeds[row, col]] if plain[row, col] == 1 else 0
 
 
 def _planes(models: Models) -> NDArray[np.float64]:
@@ -57,7 +68,7 @@ def plain_surfaces(
 
     A model is fitted to every fourth row, twice without what it does not predict. Where MIN_PLAIN of the
     surface remain and their residual passes as noise, as it must in any window, the connected pixels that
-    the model predicts are seeds.
+    the model predicts are seeds; missing pixels do not part them.
 
     Parameters
     ----------
@@ -75,7 +86,7 @@ def plain_surfaces(
     count = int(within.max(initial=0))
     if count == 0:
         return nothing, 0
-    usable = signals.flags | blocked
+    usable = np.where(blocked > 0, MISFIT, signals.flags)
     rows = slice(ROW_STEP // 2, None, ROW_STEP)
     image, part = np.ascontiguousarray(signals.image[rows]), np.ascontiguousarray(within[rows])
     left_out = np.ascontiguousarray(usable[rows])
@@ -90,7 +101,7 @@ def plain_surfaces(
         _predicted(
             image, left_out, part, models.center, _planes(models), accepted, wider * limit, 0, len(part), kept
         )
-        moments = accumulate(image, 1 - kept, part, count, 1, boxes)
+        moments = accumulate(image, kept ^ 1, part, count, 1, boxes)
     n = moments.count
     dof = np.maximum(n - 3, 1)
     rss = residuals_by_degree(moments, 0, 1)[:, 1, 0]
@@ -113,4 +124,5 @@ def plain_surfaces(
     large[0] = False
     found = int(np.count_nonzero(large))
     number = np.where(large, np.cumsum(large), 0).astype(np.int32)
-    return number[seeds], found
+    _number(seeds, number, plain)
+    return seeds, found
