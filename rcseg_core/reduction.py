@@ -196,6 +196,7 @@ def at_full_size(
     count = int(np.count_nonzero(sizes))
     surface_of = np.zeros(old_count + 1, np.int32)
     surface_of[number[small.labels]] = small.surface_labels
+    surface_of = _without_gaps(surface_of, sizes[order - 1])
     surface_labels = labels.copy()
     relabel(surface_labels, surface_of)
     surfaces = surface_of.astype(np.int64)[: count + 1]
@@ -225,6 +226,20 @@ def at_full_size(
         coarsen=partial(_renumbered, small.coarsen, number),
         describe=lambda: measured()[2](),
     )
+
+
+def _without_gaps(surface_of: NDArray[np.int32], sizes: NDArray[np.int64]) -> NDArray[np.int32]:
+    """Surfaces of regions 0..N numbered anew from the largest down; one that no pixel shows gets none.
+
+    sizes : (N,) pixels of regions 1..N
+    """
+    pixels = np.bincount(surface_of[1:], sizes, minlength=int(surface_of.max()) + 1)
+    pixels[0] = 0
+    order = np.argsort(-pixels, kind="stable")
+    order = order[pixels[order] > 0]
+    number = np.zeros(pixels.size, np.int32)
+    number[order] = np.arange(1, order.size + 1)
+    return np.asarray(number[surface_of])
 
 
 def _renumbered(coarsen: Any, number: NDArray[np.int32]) -> Grouped:

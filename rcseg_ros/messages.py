@@ -194,17 +194,24 @@ def _noise(result: Segmentation, make: Make) -> Any:
 
 
 def _merge_tree(result: Segmentation, make: Make) -> Any:
-    """The part of the merge tree above the regions; below them lie seeds, which messages do not show."""
+    """The part of the merge tree above the regions; below them lie seeds, which messages do not show.
+
+    Of a reduced frame the tree may hold regions that no pixel of the full one shows: they join nothing.
+    """
     tree, count = result.hierarchy, len(result.regions)
-    number = {int(node): label for label, node in enumerate(result.nodes) if label}
+    number = {int(node): label for label, node in enumerate(result.nodes) if 0 < label <= count}
     parent, height = [0] * count, [1.0] * count
     for merge in np.flatnonzero(tree.heights > 1).tolist():
-        below = [number[int(child)] for child in tree.children[merge]]
-        parent.append(0)
-        height.append(float(tree.heights[merge]))
-        number[tree.leaf_count + 1 + merge] = len(parent)
-        for node in below:
-            parent[node - 1] = len(parent)
+        below = [number[int(child)] for child in tree.children[merge] if int(child) in number]
+        node = tree.leaf_count + 1 + merge
+        if len(below) == 2:
+            parent.append(0)
+            height.append(float(tree.heights[merge]))
+            number[node] = len(parent)
+            for one in below:
+                parent[one - 1] = len(parent)
+        elif below:
+            number[node] = below[0]
     return make(
         "rcseg_msgs/msg/MergeTree", parent=np.array(parent, np.uint32), height=np.array(height, np.float64)
     )

@@ -1,6 +1,7 @@
 """A replay gives what segment() gives, in order, for any number of workers; outputs are whole or absent."""
 
 import json
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -29,6 +30,7 @@ from rcseg_ros.replay import ReplayRequest, replay
 from rcseg_ros.result_bag import make_message
 
 CONFIG = SegmenterConfig()
+BAGS = Path(__file__).resolve().parents[2] / "bags"
 
 
 def run(bag, output, **options):
@@ -230,6 +232,26 @@ def test_a_failed_replacement_keeps_the_old_result(tmp_path):
     with pytest.raises(InputError):
         run(empty, tmp_path / "out", force=True)
     assert len(messages(tmp_path / "out", "labels")) == 1
+
+
+def test_a_preset_that_reduces_loses_no_number(tmp_path):
+    """Small regions of the reduced frame may show on no pixel of the full one: messages leave them out."""
+    config = SegmenterConfig.preset("fast")
+    replay(ReplayRequest(BAGS / "tabletop", tmp_path / "out", config, max_frames=2))
+    shown = zip(
+        *(messages(tmp_path / "out", t) for t in ("regions", "labels", "surface_labels")), strict=True
+    )
+    for array, labels, surfaces in shown:
+        pixels = [np.bincount(decode_labels(image).ravel()) for image in (labels, surfaces)]
+        assert [region.pixel_count for region in array.regions] == pixels[0][1:].tolist()
+        assert [surface.pixel_count for surface in array.surfaces] == pixels[1][1:].tolist()
+        assert pixels[0][1:].min() > 0 and pixels[1][1:].min() > 0
+        parent, height = array.hierarchy.parent, array.hierarchy.height
+        assert len(parent) == len(height) >= len(array.regions)
+        for node, above in enumerate(parent, start=1):
+            assert above == 0 or (above > node and height[above - 1] >= height[node - 1] >= 1)
+        inner = np.bincount(parent[parent > 0], minlength=len(parent) + 1)[len(array.regions) + 1 :]
+        assert (inner == 2).all(), "every merge joins two"
 
 
 def test_the_real_laptop_recording_equals_segment(shared_data, tmp_path):
