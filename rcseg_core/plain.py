@@ -86,7 +86,7 @@ def plain_surfaces(
     count = int(within.max(initial=0))
     if count == 0:
         return nothing, 0
-    usable = np.where(blocked > 0, MISFIT, signals.flags)
+    usable: NDArray[np.uint8] = np.where(blocked > 0, np.uint8(MISFIT), signals.flags)
     rows = slice(ROW_STEP // 2, None, ROW_STEP)
     image, part = np.ascontiguousarray(signals.image[rows]), np.ascontiguousarray(within[rows])
     left_out = np.ascontiguousarray(usable[rows])
@@ -101,7 +101,7 @@ def plain_surfaces(
         _predicted(
             image, left_out, part, models.center, _planes(models), accepted, wider * limit, 0, len(part), kept
         )
-        moments = accumulate(image, kept ^ 1, part, count, 1, boxes)
+        moments = accumulate(image, kept ^ np.uint8(1), part, count, 1, boxes)
     n = moments.count
     dof = np.maximum(n - 3, 1)
     rss = residuals_by_degree(moments, 0, 1)[:, 1, 0]
