@@ -238,6 +238,9 @@ class GeneralizationConfig:
     min_effect: float = _param(
         0.25, "least fall of the rms residual that justifies a degree", unit="sigma", low=0.0, high=10.0
     )
+    creases: bool = _param(
+        True, "divide a bent surface where two that meet along a line explain it better (surfaces by range)"
+    )
     max_range_degree: int = _param(4, "highest degree of the range patches", low=1, high=4, symbol="k")
     max_color_degree: int = _param(2, "highest degree of the colour patches", low=1, high=4, symbol="k")
 
@@ -384,6 +387,7 @@ class SegmenterConfig:
                 "generalization.test": "f",
                 "borders.sharpen": False,
                 "borders.flying": "nearest",
+                "generalization.creases": False,
             }
         )
 

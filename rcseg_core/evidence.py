@@ -5,7 +5,9 @@ bounded (default): one joint model must explain BOTH sides: for each side s and 
 The first term is what noise alone costs when m pixels make one independent measurement, the second what the
 approximation limit eps_t allows; the value is the largest ratio of left to right, so 1 is the limit and the
 measure is symmetric.
-chow: the same for the total rise of both sides at once.
+A joint model of higher degree must also be the shorter account (Schwarz 1978, m pixels counting for one): its
+residual and m log(N/m) for each coefficient against those of the simplest models of both sides; else two
+faces become one that bends. chow: the same for the total rise of both sides at once.
 bayes: c_ib of eq. (21), the larger region predicts the smaller (the other way extrapolation explodes).
 points: small regions are absorbed whole (step 3) where the larger one predicts them within the tolerance.
 """
@@ -175,6 +177,21 @@ def compare_planes(planes, i, j, rule, gate_r, gate_c, shape, signal):  # type: 
 
 
 @bare
+def simplest(own, rule, k, price):  # type: ignore[no-untyped-def]
+    """Least cost of describing the range of one side alone: residual plus `price` for each coefficient.
+
+    The models are a first-degree one, the one that the side has earned, and the one that is tried.
+    """
+    high = rule.terms[rule.degree[k, 0]].shape[0] * rule.n_range
+    least = own[0] + high * price
+    if own[2] < np.inf:
+        settled = rule.terms[rule.settled[k]].shape[0] * rule.n_range
+        least = min(least, own[4] + settled * price)
+        least = min(least, own[2] + rule.terms[1].shape[0] * rule.n_range * price)
+    return least
+
+
+@bare
 def _bounded(moments, big, small, rule, own, gate_r, gate_c, work):  # type: ignore[no-untyped-def]
     """Largest ratio over sides and modalities (or of the totals), and the multiple of the limit it needs."""
     n_big = moments.power[big, 0, 0]
@@ -208,6 +225,13 @@ def _bounded(moments, big, small, rule, own, gate_r, gate_c, work):  # type: ign
             noise2 = var * rule.n_range
             budget_big = n_big * earned_tolerance(eps2, rule.relief2, n_big, own[big], noise2)
             budget_small = n_small * earned_tolerance(eps2, rule.relief2, n_small, own[small], noise2)
+            if rule.earn and terms.shape[0] > rule.terms[1].shape[0]:
+                price = var * rule.correlation[0]
+                price *= np.log(max((n_big + n_small) / rule.correlation[0], np.e))
+                apart = simplest(own[big], rule, big, price) + simplest(own[small], rule, small, price)
+                joint = own[big, 0] + rise_big + own[small, 0] + rise_small + p * price
+                if joint - budget_big - budget_small > apart:
+                    return np.inf, np.inf
         ratio, need = _weigh(
             rule.kind, n_big, n_small, rise_big, rise_small, noise, share, budget_big, budget_small
         )

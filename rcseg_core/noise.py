@@ -190,6 +190,9 @@ def _measure(
     away = away.ravel() if valid is None else away[valid[::3, ::3]]
     # 70 % of the distances are noise even when 20 % of the pixels are impulses; 1.04 sigma at 70 %
     spread = max(float(np.quantile(away, 0.7)) if away.size else 0.0, 1e-9)
+    # on a quantised sensor most pixels equal the median; then the quantum is what they may be away
+    moved = away[away > 0]
+    spread = max(spread, float(np.quantile(moved, 0.3)) if moved.size else 0.0)
     if count:
         mask = np.ones((1, 1), np.bool_) if valid is None else valid
 

@@ -18,7 +18,7 @@ from rcseg_core.hierarchy import TreeBuilder
 from rcseg_core.jit import bare
 from rcseg_core.models import Models
 from rcseg_core.moments import Moments, accumulate, extended, move_pixels, region_boxes
-from rcseg_core.signals import Signals
+from rcseg_core.signals import INVALID, Signals
 
 
 @bare
@@ -191,13 +191,24 @@ class Partition:
             self._moments = extended(self._moments, self.boxes())
         return extra
 
+    def separate(self, part: NDArray[np.bool_], flags: NDArray[np.uint8], least: int) -> int:
+        """Pixels of `part` leave their regions; at least `least` that hang together are a new one.
+
+        Returns how many regions were added; the other pixels stay unassigned.
+        """
+        self.labels[part] = 0
+        self.pixels_changed()
+        return self.add_leftovers(np.where(part, flags, np.uint8(INVALID)), least)
+
     def drop_small(self, least: int) -> None:
         """Free the pixels of regions under `least` pixels, so that they can join a neighbour."""
-        sizes = self.sizes()
-        keep = sizes >= least
+        keep = self.sizes() >= least
         keep[0] = True
-        if keep.all():
-            return
+        if not keep.all():
+            self.free(keep)
+
+    def free(self, keep: NDArray[np.bool_]) -> None:
+        """Free the pixels of all regions but those to keep, (count + 1,); keep[0] is set."""
         mapping = np.where(keep, np.cumsum(keep) - 1, 0).astype(np.int32)
         self._relabel(mapping, np.nonzero(keep)[0])
 

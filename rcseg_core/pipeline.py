@@ -24,6 +24,7 @@ from rcseg_core.stages import (
     absorb_points,
     absorb_small,
     coarser_merges,
+    divide_creases,
     fill_small_holes,
     final_models,
     group_pass,
@@ -139,14 +140,18 @@ def partition_by(
         clock.lap(f"{name} absorb")
 
     # 5-8. generalise and group on, until no region changes
+    divided = int(config.generalization.creases and name == "range")
     for round_ in range(MAX_ROUNDS):
         before = partition.count
         for degree in higher:
             group_pass(partition, signals, edges, degree, config)
         clock.lap(f"{name} generalize")
+        if divided:  # a region may hold two creases
+            divided = divide_creases(partition, signals, edges, config)
+            clock.lap(f"{name} creases")
         if not config.absorption.enabled:
             break
-        if round_ == 0:
+        if round_ == 0 or divided:
             models = settle(partition, signals, config)
             if within is None:
                 sharpen_borders(partition, partition, models, signals, edges, config)

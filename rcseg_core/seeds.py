@@ -31,7 +31,7 @@ MIN_INLIERS = 0.5
 #: Three pixels span a plane; two more tell whether it fits.
 LEAST_PIXELS = 5
 #: The residual variance of a window may exceed the noise by this factor, besides the tolerance.
-NOISE_FACTOR = 2.0
+NOISE_FACTOR = 1.4
 
 
 @kernel

@@ -7,8 +7,10 @@ from numpy.typing import NDArray
 
 from rcseg_core.adjacency import Pairs
 from rcseg_core.borders import Sides, sharpen
+from rcseg_core.chamfers import dissolve_chamfers
 from rcseg_core.config import SegmenterConfig
 from rcseg_core.continuity import continuous_pairs
+from rcseg_core.creases import split_creases
 from rcseg_core.gaps import fill_holes, treat_flying
 from rcseg_core.generalization import choose_degrees, residuals_by_degree
 from rcseg_core.grouping import Grouped, add_merged, group
@@ -20,6 +22,8 @@ from rcseg_core.signals import MISFIT, Signals, scales
 
 #: A limit that any pair with a joint model keeps.
 NO_LIMIT = 1e9
+#: Least face that a crease may part off, and largest chamfer, px at 640x480.
+LEAST_FACE, MOST_CHAMFER = 60, 1000
 
 
 def make_rule(
@@ -123,6 +127,21 @@ def absorb_points(partition: Partition, signals: Signals, models: Models, config
     """
     partition.absorb(signals, models, config.absorption.max_cost)
     return partition.add_leftovers(signals.flags, scaled(config.absorption.min_region, signals.flags))
+
+
+def divide_creases(
+    partition: Partition, signals: Signals, edges: NDArray[np.uint8], config: SegmenterConfig
+) -> int:
+    """Bent regions are divided along creases, and chamfers dissolve; the creases are added to `edges`.
+
+    Returns how many regions were changed; some pixels are without one then.
+    """
+    changed = split_creases(partition, signals, edges, scaled(LEAST_FACE, signals.flags))
+    if config.absorption.enabled:
+        models = final_models(partition, signals, config)[1]
+        pairs = partition.pairs(edges, config.grouping.max_gap)
+        changed += dissolve_chamfers(partition, signals, models, pairs, scaled(MOST_CHAMFER, signals.flags))
+    return changed
 
 
 def settle(partition: Partition, signals: Signals, config: SegmenterConfig) -> Models:

@@ -217,3 +217,32 @@ def test_noise_and_tolerance_depend_on_depth_as_the_law_says():
     law = np.array([1.0, 0.5, 0.25, 2.0, 0.1])
     assert local_scales(law, 2.0) == pytest.approx(((1 + 1 + 1) ** 2, 2.2**2))
     assert local_scales(np.array([0.01, 0, 0, 1.0, 0]), 0.0)[0] == pytest.approx(0.2**2), "the floor of sigma"
+
+
+def corner(fold, seed=0):
+    """Two flat sides that meet along a line with a fold of slope, range only."""
+    cols = np.mgrid[: SHAPE[0], : SHAPE[1]][1]
+    labels = np.where(cols < 30, 1, 2).astype(np.int32)
+    value = 0.2 * cols + fold * np.maximum(cols - 29.5, 0.0)
+    image = value[..., None] + np.random.default_rng(seed).normal(size=(*SHAPE, 1))
+    return crafted_signals(image, 1), labels
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_two_flat_sides_are_no_bent_surface_even_if_it_is_within_the_noise(seed):
+    """The quartic's misfit is within what noise may cost, but twice as many coefficients must be worth it."""
+    signals, labels = corner(0.15, seed)
+    *_, allowed = compared(signals, labels, degrees=(4, 1))[0]
+    assert not allowed
+    moments, rule, work, own, _ = prepared(signals, labels, degrees=(4, 1))
+    boxes = region_boxes(labels, 2)
+    assert compare(moments, 1, 2, rule._replace(earn=False), own, boxes, 1.0, 1.0, work)[2]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_two_parts_of_a_bowl_are_one_surface(seed):
+    rows, cols = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    value = 0.02 * (cols - 30.0) ** 2 + 0.015 * (rows - 20.0) ** 2
+    image = value[..., None] + np.random.default_rng(seed).normal(size=(*SHAPE, 1))
+    signals = crafted_signals(image, 1)
+    assert compared(signals, np.where(cols < 30, 1, 2).astype(np.int32), degrees=(2, 1))[0][2]

@@ -112,6 +112,15 @@ def test_quantised_depth_does_not_give_zero(step, within):
     assert noise.range_sigma(np.array(0.35)) == pytest.approx(step / np.sqrt(12), rel=within)
 
 
+def test_a_quantum_above_the_noise_does_not_hide_it():
+    """Most pixels equal their median then; what is one quantum away is noise as well, not an impulse."""
+    correlated = cv2.GaussianBlur(white(), (0, 0), 1.5)
+    correlated *= 0.84 * SIGMA / correlated.std()
+    step = 1.87 * SIGMA
+    noise = estimated(np.round((room() + correlated) / step) * step)
+    assert noise.range_sigma(np.array(0.35)) == pytest.approx(SIGMA, rel=0.12)
+
+
 def test_an_exact_frame_has_the_floor_and_not_zero():
     noise = estimated(room())
     typical = np.median(room())
