@@ -192,6 +192,17 @@ def simplest(own, rule, k, price):  # type: ignore[no-untyped-def]
 
 
 @bare
+def _flat_joint(moments, big, small, rule, price, work):  # type: ignore[no-untyped-def]
+    """Cost of describing the range of both sides by one first-degree model, as `simplest`."""
+    for c in range(rule.n_range):
+        work.sum_energy[c] = moments.energy[big, c] + moments.energy[small, c]
+    terms = rule.terms[1]
+    solve(work.sum_power, work.sum_cross, 0, rule.n_range, terms, work.gram, work.coef)
+    rss = residual(work.sum_power, work.sum_cross, work.sum_energy, 0, rule.n_range, terms, work.coef)
+    return rss + terms.shape[0] * rule.n_range * price
+
+
+@bare
 def _bounded(moments, big, small, rule, own, gate_r, gate_c, work):  # type: ignore[no-untyped-def]
     """Largest ratio over sides and modalities (or of the totals), and the multiple of the limit it needs."""
     n_big = moments.power[big, 0, 0]
@@ -229,8 +240,9 @@ def _bounded(moments, big, small, rule, own, gate_r, gate_c, work):  # type: ign
                 price = var * rule.correlation[0]
                 price *= np.log(max((n_big + n_small) / rule.correlation[0], np.e))
                 apart = simplest(own[big], rule, big, price) + simplest(own[small], rule, small, price)
+                apart += budget_big + budget_small
                 joint = own[big, 0] + rise_big + own[small, 0] + rise_small + p * price
-                if joint - budget_big - budget_small > apart:
+                if joint > apart and _flat_joint(moments, big, small, rule, price, work) > apart:
                     return np.inf, np.inf
         ratio, need = _weigh(
             rule.kind, n_big, n_small, rise_big, rise_small, noise, share, budget_big, budget_small

@@ -152,6 +152,7 @@ CHANGES = {
     "grouping.edge_gate": (False,),
     "generalization.hypothesis": ("region",),
     "generalization.test": ("f",),
+    "generalization.creases": (False,),
     "borders.sharpen": (False,),
     "borders.flying": ("nearest", "unassigned"),
 }
