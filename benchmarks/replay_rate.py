@@ -175,10 +175,10 @@ def itemize(bag: Path, config: SegmenterConfig, outputs: tuple[str, ...], folder
         for header, frame, seconds in decoded(bag):
             spent.setdefault("decode", []).append(1e3 * seconds)
             result = timed("segment()", partial(segment, frame, config))
-            timed("regions: patches", partial(getattr, result, "regions"))
-            timed("merge tree", partial(getattr, result, "hierarchy"))
             if "regions" in outputs:
-                timed("surfaces: shapes", partial(getattr, result, "surfaces"))
+                timed("regions: patches", partial(getattr, result, "regions"))
+                timed("regions: merge tree", partial(getattr, result, "hierarchy"))
+                timed("regions: shapes of surfaces", partial(getattr, result, "surfaces"))
             timed("metrics", partial(frame_row, header, 0, frame, result, 0.0))
             messages = ResultMessages(header, frame, result, make_message)
             for name in outputs:

@@ -21,7 +21,7 @@ from recordings import (
     write_mcap,
 )
 
-from rcseg_core import InputError, SegmenterConfig, segment
+from rcseg_core import InputError, Segmentation, SegmenterConfig, segment
 from rcseg_core.parallel import cores, threads
 from rcseg_ros.bag import Recording
 from rcseg_ros.conversions import decode_cloud, decode_image, decode_labels, header_of
@@ -188,6 +188,17 @@ def test_only_the_wanted_outputs_and_frames(tmp_path):
     assert len(summary.frames) == 2
     with Recording(tmp_path / "out") as recording:
         assert {t.name: t.count for t in recording.topics.values()} == {"/rcseg/labels": 2}
+
+
+def test_regions_are_described_only_where_somebody_wants_them(tmp_path, monkeypatch):
+    def refuse(self):
+        raise AssertionError("described for nobody")
+
+    bag = write_folder(tmp_path / "in", depth_entries(1))
+    monkeypatch.setattr(Segmentation, "regions", property(refuse))
+    outputs = ("labels", "surface_labels", "edges", "overlay", "reconstruction")
+    summary = run(bag, tmp_path / "out", outputs=outputs)
+    assert summary.frames[0]["regions"] == decode_labels(messages(tmp_path / "out", "labels")[0]).max()
 
 
 def test_a_fault_in_mid_run_leaves_what_was_finished(tmp_path, monkeypatch):
