@@ -9,6 +9,7 @@ equal. Under a pinhole two surfaces have the same inverse depth exactly on the i
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import cv2
@@ -19,6 +20,7 @@ from rcseg_core.edges import ORIENTATION
 from rcseg_core.generalization import residuals_by_degree
 from rcseg_core.jit import bare, kernel
 from rcseg_core.moments import UNIT_PX, Moments, tensor_exponents
+from rcseg_core.parallel import together
 from rcseg_core.partition import Partition
 from rcseg_core.signals import INVALID, MISFIT, RANGE_OUTLIER, Signals, local_scales, scales
 
@@ -349,18 +351,25 @@ def split_creases(partition: Partition, signals: Signals, edges: NDArray[np.uint
     least : pixels of a region that is looked at, and of a part. Returns how many were divided.
     """
     boxes = partition.boxes()
+    regions = bent_regions(partition.moments(signals, 1), signals, least)
+    usable = signals.flags & (INVALID | RANGE_OUTLIER | MISFIT) == 0
+    divisions: list[Division | None] = [None] * len(regions)
+
+    def look_at(i: int) -> None:
+        window, own = _cutout(partition.labels, boxes[regions[i]], regions[i])
+        rows, cols = np.nonzero(own & usable[window])
+        if rows.size >= least:
+            divisions[i] = find_crease(rows + window[0].start, cols + window[1].start, signals)
+
+    together(*(partial(look_at, i) for i in range(len(regions))))
     freed = np.zeros(partition.labels.shape, np.bool_)
     divided = 0
-    for k in bent_regions(partition.moments(signals, 1), signals, least):
-        row, col = int(boxes[k, 0]), int(boxes[k, 1])
-        window = np.s_[row : boxes[k, 2] + 1, col : boxes[k, 3] + 1]
-        own = partition.labels[window] == k
-        rows, cols = np.nonzero(own & (signals.flags[window] & (INVALID | RANGE_OUTLIER | MISFIT) == 0))
-        division = find_crease(rows + row, cols + col, signals) if rows.size >= least else None
+    for k, division in zip(regions, divisions, strict=True):
         if division is None:
             continue
+        window, own = _cutout(partition.labels, boxes[k], k)
         rows, cols = np.nonzero(own)
-        second = division.on_second(rows + row, cols + col)
+        second = division.on_second(rows + window[0].start, cols + window[1].start)
         if 2 * second.sum() > second.size:
             second = ~second
         part = np.zeros(own.shape, np.uint8)
@@ -373,3 +382,12 @@ def split_creases(partition: Partition, signals: Signals, edges: NDArray[np.uint
     if divided:
         partition.separate(freed, signals.flags, least)
     return divided
+
+
+def _cutout(
+    labels: NDArray[np.int32], box: NDArray[np.int64], k: int
+) -> tuple[tuple[slice, slice], NDArray[np.bool_]]:
+    """The box of region k as slices, and its pixels in there."""
+    row_min, col_min, row_max, col_max = (int(side) for side in box)
+    window = slice(row_min, row_max + 1), slice(col_min, col_max + 1)
+    return window, labels[window] == k
