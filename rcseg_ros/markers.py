@@ -1,5 +1,5 @@
-"""Regions as visualization_msgs markers: the fitted surfaces, oriented boxes, normals and labels, for RViz
-and Foxglove.
+"""Regions as visualization_msgs markers: the fitted surfaces, oriented boxes, normals and labels, and the
+spheres and cylinders among the surfaces, for RViz and Foxglove.
 
 Drawn from the RegionArray message, not from the core's result, so any program that holds the message can
 draw the same; the label image only cuts each patch to its region's outline.
@@ -16,6 +16,8 @@ from scipy.spatial.transform import Rotation
 from rcseg_ros.outputs import Make
 from rcseg_ros.patches import surface_points
 
+CIRCLE_LINES = 24
+SPHERE, CYLINDER = 2, 3  # constants of rcseg_msgs/Primitive
 MESH_PX = 12  # side of a mesh cell; markers are pictures, not data
 ARROW, LINE_LIST, TEXT, TRIANGLES, DELETE_ALL = 0, 5, 9, 11, 3  # constants of visualization_msgs/Marker
 
@@ -45,6 +47,11 @@ def marker_array(array: Any, labels: NDArray[np.int32], make: Make) -> Any:
                 markers.append(_marker(array.header, name, region.label, kind, points, rgb, alpha, make))
         if np.isfinite(region.centroid.z):
             markers.append(_text(array.header, region, make))
+    for surface in array.surfaces:
+        lines = shape_lines(array, surface)
+        if len(lines) and np.isfinite(lines).all():
+            white = np.ones(3)
+            markers.append(_marker(array.header, "shapes", surface.label, LINE_LIST, lines, white, 1.0, make))
     return make("visualization_msgs/msg/MarkerArray", markers=markers)
 
 
@@ -75,6 +82,37 @@ def box_edges(region: Any) -> NDArray[np.float64]:
     ]
     corners = np.array(center) + rotation.apply(_CORNERS * [size.x, size.y, size.z])
     return corners[np.array(_EDGES).ravel()]
+
+
+def shape_lines(array: Any, surface: Any) -> NDArray[np.float64]:
+    """(2 M, 3) ends of the lines that show a recognised sphere or cylinder; none for other surfaces.
+
+    A sphere is three circles, a cylinder a ring at either end of the boxes of its regions and four lines.
+    """
+    shape = surface.primitive
+    values = np.asarray(shape.parameters)
+    if shape.kind == SPHERE:
+        return np.concatenate([_circle(values[:3], axis, values[3]) for axis in np.eye(3)])
+    if shape.kind != CYLINDER:
+        return np.empty((0, 3))
+    point, axis, radius = values[:3], values[3:6], values[6]
+    corners = np.concatenate([box_edges(array.regions[label - 1]) for label in surface.regions])
+    heights = (corners[np.isfinite(corners).all(axis=1)] - point) @ axis
+    if not len(heights):
+        return np.empty((0, 3))
+    low, high = (_circle(point + height * axis, axis, radius) for height in (heights.min(), heights.max()))
+    quarter = len(low) // 4
+    sides = np.stack([low[::quarter], high[::quarter]], axis=1).reshape(-1, 3)
+    return np.concatenate([low, high, sides])
+
+
+def _circle(center: NDArray[Any], axis: NDArray[Any], radius: float) -> NDArray[np.float64]:
+    """(2 CIRCLE_LINES, 3) ends of the lines of a circle about a unit vector."""
+    first = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
+    first /= np.linalg.norm(first)
+    angle = 2 * np.pi * np.arange(CIRCLE_LINES + 1)[:, None] / CIRCLE_LINES
+    points = center + radius * (np.cos(angle) * first + np.sin(angle) * np.cross(axis, first))
+    return np.stack([points[:-1], points[1:]], axis=1).reshape(-1, 3)
 
 
 def _arrow(region: Any) -> NDArray[np.float64]:

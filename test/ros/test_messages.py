@@ -13,6 +13,7 @@ import pytest
 
 from rcseg_core import PinholeCamera, RangeColorFrame, SegmenterConfig, segment
 from rcseg_core.primitives import NONE
+from rcseg_core.synthetic import make_scene
 from rcseg_ros.conversions import Header
 from rcseg_ros.messages import region_array
 from rcseg_ros.outputs import header_message
@@ -204,3 +205,33 @@ def test_markers_draw_every_region(case):
         assert len(corners) % 3 == 0
         center = np.array([region.centroid.x, region.centroid.y, region.centroid.z])
         assert np.linalg.norm(corners.mean(axis=0) - center) < 0.2
+
+
+def test_markers_draw_spheres_and_cylinders_where_they_are():
+    from rcseg_ros.markers import marker_array
+
+    def make(type_name, **fields):
+        return SimpleNamespace(type_name=type_name, **fields)
+
+    scene = make_scene("curved", 1, width=320, height=240)
+    result = segment(scene.frame)
+    message = region_array(scene.frame, result, header_message(Header(5, "f"), make_message), make_message)
+    drawn = {
+        m.id: np.array([(p.x, p.y, p.z) for p in m.points])
+        for m in marker_array(message, result.labels, make).markers[1:]
+        if m.ns == "shapes"
+    }
+    kinds = {s.label: s.primitive for s in result.surfaces if s.primitive.kind in ("sphere", "cylinder")}
+    assert drawn.keys() == kinds.keys() and {k.kind for k in kinds.values()} == {"sphere", "cylinder"}
+    for label, shape in kinds.items():
+        lines, values = drawn[label], shape.parameters
+        assert len(lines) % 2 == 0
+        local = lines - values["center" if shape.kind == "sphere" else "point"]
+        if shape.kind == "cylinder":
+            height = local @ values["axis"]
+            points = scene.clean_points[result.surface_labels == label]
+            seen = (points - values["point"]) @ values["axis"]
+            assert height.min() < np.nanquantile(seen, 0.02) and height.max() > np.nanquantile(seen, 0.98)
+            assert np.ptp(height) < 1.5 * np.nanmax(seen) - 1.5 * np.nanmin(seen)
+            local = local - height[:, None] * values["axis"]
+        np.testing.assert_allclose(np.linalg.norm(local, axis=1), values["radius"], rtol=1e-9)
