@@ -218,15 +218,18 @@ def _on_rim_slope(raw, median, row, col, scale, limit):  # type: ignore[no-untyp
 
 
 @bare
-def _in_company(color, row, col, scale, n_range, limit):  # type: ignore[no-untyped-def]
-    """Whether enough neighbours share the colour of a pixel: a line of two pixels is no impulse."""
-    height, width, channels = color.shape
+def _in_company(image, row, col, scale, first, limit):  # type: ignore[no-untyped-def]
+    """Whether enough neighbours share the colour, or the range, of a pixel: a line of two pixels is no impulse.
+
+    image : (H, W, k), whose channels have the sigmas scale[first], scale[first + 1] ...
+    """
+    height, width, channels = image.shape
     alike = 0
     for r in range(max(row - 1, 0), min(row + 2, height)):
         for c in range(max(col - 1, 0), min(col + 2, width)):
             far = 0.0
             for k in range(channels):
-                d = (np.float64(color[r, c, k]) - np.float64(color[row, col, k])) / scale[n_range + k]
+                d = (np.float64(image[r, c, k]) - np.float64(image[row, col, k])) / scale[first + k]
                 far = max(far, d * d)
             alike += far <= limit
     return alike > COMPANY
@@ -266,6 +269,7 @@ def whiten(  # type: ignore[no-untyped-def]
                     threshold > 0.0
                     and far > limit * var
                     and not _on_rim_slope(raw, median_r, row, col, scale, limit * var)
+                    and not _in_company(raw, row, col, scale, 0, 0.25 * limit * var)
                 ):
                     flag = RANGE_OUTLIER
                 else:
