@@ -219,7 +219,7 @@ def _on_rim_slope(raw, median, row, col, scale, limit):  # type: ignore[no-untyp
 
 @bare
 def _in_company(image, row, col, scale, first, limit):  # type: ignore[no-untyped-def]
-    """Whether enough neighbours share the colour, or the range, of a pixel: a line of two pixels is no impulse.
+    """Whether enough neighbours share the colour or range of a pixel: a line of two pixels is no impulse.
 
     image : (H, W, k), whose channels have the sigmas scale[first], scale[first + 1] ...
     """
