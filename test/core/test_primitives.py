@@ -54,7 +54,7 @@ def surface_at(frame, inside):
 OTHERS = {
     "saddle": lambda: relief(lambda x, y: 0.5 * (x * x - y * y)),
     "paraboloid": lambda: relief(lambda x, y: 1.5 * (x * x + y * y)),
-    "parabolic trough": lambda: relief(lambda x, y: 1.8 * x * x),
+    "parabolic groove": lambda: relief(lambda x, y: 1.8 * x * x),
     "long ellipsoid": lambda: ellipsoid((0.2, 0.3, 0.2)),
     "flat ellipsoid": lambda: ellipsoid((0.3, 0.3, 0.1)),
 }
