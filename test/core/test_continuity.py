@@ -1,4 +1,4 @@
-"""Parts of a curved surface are joined where they continue each other, planes and steps never."""
+"""Parts of a surface are joined where they continue each other; across creases, steps and edges never."""
 
 import numpy as np
 import pytest
@@ -53,8 +53,30 @@ def test_the_smaller_part_of_a_curved_surface_is_taken_in():
     assert joined(bowl()) == [[1, 2]]
 
 
-def test_planes_are_never_joined_this_way():
-    assert joined(0.3 * COLS, curved=np.zeros(3, bool), degree=1) == []
+FLAT = np.zeros(3, bool)
+
+
+def bend(degrees):
+    """A plane that turns by an angle at the border; 10 units per UNIT_PX are 45 degrees."""
+    return np.maximum(COLS - 43.5, 0) * np.tan(np.deg2rad(degrees)) * 10.0 / UNIT_PX
+
+
+def test_flat_parts_continue_where_they_turn_a_little():
+    """The corner of a table that the sensor's distortion bends."""
+    assert joined(bend(12.0), curved=FLAT, degree=1) == [[1, 2]]
+    assert joined(bend(24.0), curved=FLAT, degree=1) == []
+    assert joined(bend(24.0), degree=1) == [[1, 2]]  # curved ones may turn further
+
+
+def test_an_edge_along_the_border_parts_flat_parts():
+    edges = np.zeros(SHAPE, np.uint8)
+    edges[:10, 43:45] = 2
+    assert joined(bend(12.0), curved=FLAT, degree=1, edges=edges) == []
+    assert joined(bend(12.0), degree=1, edges=edges) == [[1, 2]]
+
+
+def test_flat_slivers_have_no_liberties():
+    assert joined(bend(40.0), curved=FLAT, degree=1, split=61, sliver_px=500) == []
 
 
 def test_a_step_parts_them():
