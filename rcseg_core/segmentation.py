@@ -134,36 +134,23 @@ class Segmentation:
     @cached_property
     def regions(self) -> Sequence[Region]:
         """All regions, ``regions[i].label == i + 1``; described on first use."""
-        return [replace(region, lifetimes=self.persistence) for region in self.describe()]
+        return [replace(region, lifetimes=self._merging.persistence) for region in self.describe()]
 
     @cached_property
     def scale(self) -> Scale:
         """What the levels of the merge tree are in metres and in sigmas."""
-        if self.view is not None:
-            return self.view.scale
-        signals = self.signals
-        typical = float(signals.offset[0])
-        if signals.inverse_depth:
-            depth_m, sigma_m = 1.0 / typical, float(signals.scale[0]) / typical**2  # dz = z^2 dw
-        else:
-            depth_m, sigma_m = float("nan"), float(np.sqrt(np.mean(signals.scale[: signals.n_range] ** 2)))
-        return Scale(depth_m, float(signals.law[3]) * sigma_m, sigma_m)
+        return _scale(self.signals, self.view)
 
     @cached_property
-    def _persistence(self) -> NDArray[np.float64]:
-        """(N + 1,) persistence of each region, see `Region.persistence`."""
-        count = len(self.nodes) - 1
-        birth = join_heights(self.tree, self.labels, self.leaves, count)
-        if self.range_tree is not None and self.range_leaves is not None:
-            birth = np.maximum(birth, join_heights(self.range_tree, self.labels, self.range_leaves, count))
-        parents = self.hierarchy.parents()[self.nodes]
-        heights = np.concatenate([[np.inf], np.zeros(self.hierarchy.leaf_count), self.hierarchy.heights])
-        # a region is one piece at level 1 whatever became of its border pixels
-        return np.asarray(heights[parents] / np.clip(birth, self.scale.noise_level, 1.0))
+    def _merging(self) -> _Merging:
+        return _Merging(
+            self.tree, self.range_tree, self.labels, self.leaves, self.range_leaves, self.nodes, self.coarsen,
+            self.measure, self.view,
+        )  # fmt: skip
 
     def persistence(self) -> NDArray[np.float64]:
         """(N + 1,) persistence of regions 1..N, see `Region.persistence`; index 0 is of no meaning."""
-        return self._persistence
+        return self._merging.persistence()
 
     @cached_property
     def surfaces(self) -> Sequence[Surface]:
@@ -180,17 +167,13 @@ class Segmentation:
             surfaces.append(Surface(s, pixels, box, tuple(r.label for r in parts[s]), *recognise(part)))
         return surfaces
 
-    @cached_property
+    @property
     def hierarchy(self) -> Hierarchy:
         """The merge tree: seeds to regions (heights up to 1), regions to what a wider limit joins (above 1).
 
         `nodes` (N + 1,) holds the node of each region.
         """
-        builder = TreeBuilder.resume(self.tree)
-        grouped = self.coarsen()
-        above = np.maximum(grouped.heights, np.nextafter(1.0, 2.0))
-        builder.merge(grouped.merges, above, self.nodes.copy())
-        return builder.build()
+        return self._merging.hierarchy
 
     def labels_at(
         self, level: float | None = None, *, tolerance_m: float | None = None, sigmas: float | None = None
@@ -244,6 +227,60 @@ class Segmentation:
         color : (H, W, 3) uint8; 0 where unlabelled
         """
         return render(self.models, self.labels, self.signals, self.camera)
+
+
+@dataclass(frozen=True)
+class _Merging:
+    """How the regions of a segmentation merge; the fields are those of `Segmentation`.
+
+    Apart from it, since its regions refer to this: with a cycle the memory of a frame would not be free at once.
+    """
+
+    tree: Hierarchy
+    range_tree: Hierarchy | None
+    labels: NDArray[np.int32]
+    leaves: NDArray[np.int32]
+    range_leaves: NDArray[np.int32] | None
+    nodes: NDArray[np.int64]
+    coarsen: Callable[[], Grouped]
+    measure: Callable[[], tuple[Signals, Models]]
+    view: Segmentation | None
+
+    @cached_property
+    def hierarchy(self) -> Hierarchy:
+        builder = TreeBuilder.resume(self.tree)
+        grouped = self.coarsen()
+        above = np.maximum(grouped.heights, np.nextafter(1.0, 2.0))
+        builder.merge(grouped.merges, above, self.nodes.copy())
+        return builder.build()
+
+    @cached_property
+    def _persistence(self) -> NDArray[np.float64]:
+        count = len(self.nodes) - 1
+        birth = join_heights(self.tree, self.labels, self.leaves, count)
+        if self.range_tree is not None and self.range_leaves is not None:
+            birth = np.maximum(birth, join_heights(self.range_tree, self.labels, self.range_leaves, count))
+        parents = self.hierarchy.parents()[self.nodes]
+        heights = np.concatenate([[np.inf], np.zeros(self.hierarchy.leaf_count), self.hierarchy.heights])
+        least = _scale(self.measure()[0], self.view).noise_level
+        # a region is one piece at level 1 whatever became of its border pixels
+        return np.asarray(heights[parents] / np.clip(birth, least, 1.0))
+
+    def persistence(self) -> NDArray[np.float64]:
+        """(N + 1,) see `Segmentation.persistence`."""
+        return self._persistence
+
+
+def _scale(signals: Signals, view: Segmentation | None) -> Scale:
+    """See `Segmentation.scale`."""
+    if view is not None:
+        return view.scale
+    typical = float(signals.offset[0])
+    if signals.inverse_depth:
+        depth_m, sigma_m = 1.0 / typical, float(signals.scale[0]) / typical**2  # dz = z^2 dw
+    else:
+        depth_m, sigma_m = float("nan"), float(np.sqrt(np.mean(signals.scale[: signals.n_range] ** 2)))
+    return Scale(depth_m, float(signals.law[3]) * sigma_m, sigma_m)
 
 
 def _paired(first: NDArray[np.integer], second: NDArray[np.integer]) -> NDArray[np.int64]:

@@ -1,5 +1,7 @@
 """The result: levels of the merge tree, reconstruction, and answers that stay the same."""
 
+import gc
+import weakref
 from itertools import pairwise
 
 import numpy as np
@@ -185,3 +187,23 @@ def test_compact_numbers_from_the_most_frequent_down():
     assert compact(image).tolist() == [[0, 3, 3, 1], [1, 1, 2, 2], [0, 0, 0, 4]]
     assert compact(np.zeros((2, 2), int)).tolist() == [[0, 0], [0, 0]]
     assert compact(image).dtype == np.int32
+
+
+def test_a_result_leaves_nothing_behind():
+    """No cycle of references: the memory of a frame is free as soon as nobody holds the result."""
+    frame = make_scene("blocks", 5, width=160, height=120).frame
+    for changes in ({}, {"signal.reduction": 2}, {"grouping.order": "joint"}):
+        result = segment(frame, SegmenterConfig().replace(changes))
+        assert result.regions[0].persistence >= 1
+        assert result.surfaces and result.hierarchy.leaf_count
+        result.labels_at(2.0)
+        result.reconstruct()
+        region = result.regions[0]
+        gone = weakref.ref(result)
+        gc.disable()
+        try:
+            del result
+            assert gone() is None, changes
+        finally:
+            gc.enable()
+        assert region.persistence >= 1  # a region can still tell
