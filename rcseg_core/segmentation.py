@@ -233,7 +233,7 @@ class Segmentation:
 class _Merging:
     """How the regions of a segmentation merge; the fields are those of `Segmentation`.
 
-    Apart from it, since its regions refer to this: with a cycle the memory of a frame would not be free at once.
+    Apart from it, since its regions refer to this: with a cycle the memory of a frame would stay for a while.
     """
 
     tree: Hierarchy
