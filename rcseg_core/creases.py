@@ -9,7 +9,6 @@ equal. Under a pinhole two surfaces have the same inverse depth exactly on the i
 
 from __future__ import annotations
 
-from functools import partial
 from typing import NamedTuple
 
 import cv2
@@ -20,7 +19,6 @@ from rcseg_core.edges import ORIENTATION
 from rcseg_core.generalization import residuals_by_degree
 from rcseg_core.jit import bare, kernel
 from rcseg_core.moments import UNIT_PX, Moments, tensor_exponents
-from rcseg_core.parallel import together
 from rcseg_core.partition import Partition
 from rcseg_core.signals import INVALID, MISFIT, RANGE_OUTLIER, Signals, local_scales, scales
 
@@ -353,21 +351,16 @@ def split_creases(partition: Partition, signals: Signals, edges: NDArray[np.uint
     boxes = partition.boxes()
     regions = bent_regions(partition.moments(signals, 1), signals, least)
     usable = signals.flags & (INVALID | RANGE_OUTLIER | MISFIT) == 0
-    divisions: list[Division | None] = [None] * len(regions)
-
-    def look_at(i: int) -> None:
-        window, own = _cutout(partition.labels, boxes[regions[i]], regions[i])
-        rows, cols = np.nonzero(own & usable[window])
-        if rows.size >= least:
-            divisions[i] = find_crease(rows + window[0].start, cols + window[1].start, signals)
-
-    together(*(partial(look_at, i) for i in range(len(regions))))
     freed = np.zeros(partition.labels.shape, np.bool_)
     divided = 0
-    for k, division in zip(regions, divisions, strict=True):
+    for k in regions:
+        window, own = _cutout(partition.labels, boxes[k], k)
+        rows, cols = np.nonzero(own & usable[window])
+        if rows.size < least:
+            continue
+        division = find_crease(rows + window[0].start, cols + window[1].start, signals)
         if division is None:
             continue
-        window, own = _cutout(partition.labels, boxes[k], k)
         rows, cols = np.nonzero(own)
         second = division.on_second(rows + window[0].start, cols + window[1].start)
         if 2 * second.sum() > second.size:

@@ -21,7 +21,7 @@ from scipy.optimize import nnls
 
 from rcseg_core.config import NoiseConfig
 from rcseg_core.jit import bare
-from rcseg_core.parallel import over_bands
+from rcseg_core.parallel import LEAST_ROWS, over_bands
 
 WINDOW_PX = 21
 #: Windows to a side of the image that are enough for its quantiles; small images overlap them.
@@ -199,7 +199,7 @@ def _measure(
         def measure_rows(_: int, first: int, last: int) -> None:
             window_residuals(values, median, mask, channel, spread, stride, first, last, table)
 
-        over_bands(rows, measure_rows)
+        over_bands(rows, measure_rows, least=1 if height >= LEAST_ROWS else rows + 1)
     table = table[np.isfinite(table[:, :2]).all(axis=1)]
     quiet = table[table[:, 1] <= np.median(table[:, 1])] if len(table) else table
     quiet = quiet[np.isfinite(quiet[:, 2]) & (quiet[:, 1] > 0)]

@@ -13,6 +13,8 @@ from concurrent.futures import ThreadPoolExecutor, wait
 
 #: Bands of an image: enough to share out evenly, few enough that their tables are added up in no time.
 BANDS = 4
+#: Images of fewer rows are done sooner than another thread has woken up.
+LEAST_ROWS = 300
 
 _pool: ThreadPoolExecutor | None = None
 _threads = 0
@@ -90,6 +92,10 @@ def together(*tasks: Callable[[], object]) -> None:
         helper.result()
 
 
-def over_bands(height: int, work: Callable[[int, int, int], object]) -> None:
-    """Call work(band, first row, row after the last) for each band."""
+def over_bands(height: int, work: Callable[[int, int, int], object], least: int = LEAST_ROWS) -> None:
+    """Call work(band, first row, row after the last) for each band; one after another below `least` rows."""
+    if height < least:
+        for i, (first, last) in enumerate(bands(height)):
+            work(i, first, last)
+        return
     together(*(lambda i=i, a=a, b=b: work(i, a, b) for i, (a, b) in enumerate(bands(height))))

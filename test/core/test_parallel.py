@@ -25,7 +25,7 @@ def test_every_task_runs_once(number):
     parallel.together(*(lambda i=i: done.append(i) for i in range(50)))
     assert sorted(done) == list(range(50))
     bands = []
-    parallel.over_bands(100, lambda *band: bands.append(band))
+    parallel.over_bands(100, lambda *band: bands.append(band), least=1)
     assert sorted(bands) == [(0, 0, 25), (1, 25, 50), (2, 50, 75), (3, 75, 100)]
 
 
@@ -54,7 +54,9 @@ def test_nested_passes_of_many_callers_end(number):
     done = []
 
     def caller():
-        parallel.together(*(lambda: parallel.over_bands(8, lambda *_: done.append(1)) for _ in range(6)))
+        parallel.together(
+            *(lambda: parallel.over_bands(8, lambda *_: done.append(1), least=1) for _ in range(6))
+        )
 
     threads = [threading.Thread(target=caller, daemon=True) for _ in range(12)]
     for thread in threads:
@@ -78,3 +80,9 @@ def test_threads_come_from_the_environment(monkeypatch):
     parallel.set_threads(0)
     with pytest.raises(ValueError, match="threads"):
         parallel.set_threads(-1)
+
+
+def test_small_images_stay_on_one_thread(number):
+    seen = set()
+    parallel.over_bands(parallel.LEAST_ROWS - 1, lambda *_: seen.add(threading.get_ident()))
+    assert seen == {threading.get_ident()}
