@@ -195,6 +195,12 @@ class GroupingConfig:
         20.0, "approximation limit of the colour models", unit="levels", low=0.0, high=255.0,
         symbol="epsilon_t (colour)",
     )  # fmt: skip
+    intensity_weight: float = _param(
+        1.0,
+        "weight of brightness beside chromaticity when colours are compared; below 1 shadows, reflections"
+        " and light gradients part regions less, and so does grey print; 0.25 to 0.5 for uneven light",
+        low=0.1, high=1.0,
+    )  # fmt: skip
     relief_tolerance: float = _param(
         0.1, "a curved surface may miss this share of its own relief (rms about a plane), where that is more",
         unit="fraction of relief", low=0.0, high=1.0,

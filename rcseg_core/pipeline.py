@@ -16,10 +16,10 @@ from rcseg_core.errors import ConfigError
 from rcseg_core.frame import RangeColorFrame
 from rcseg_core.partition import Partition, majority
 from rcseg_core.reduction import LEAST_SIDE_PX, at_full_size, reduced, unreduced
-from rcseg_core.reflectance import normalize_reflectance
+from rcseg_core.reflectance import normalize_reflectance, weigh_intensity
 from rcseg_core.seeds import initial_partition
 from rcseg_core.segmentation import Segmentation
-from rcseg_core.signals import Signals, build_signals
+from rcseg_core.signals import MISFIT, Signals, build_signals
 from rcseg_core.stages import (
     absorb_points,
     absorb_small,
@@ -82,7 +82,8 @@ def segment(
         clock.lap("squares")
         result = at_full_size(frame, color, segment(squares, unreduced(config)), config)
         return replace(result, timings=clock.seconds | result.timings)
-    signals = build_signals(frame, color, config)
+    evidence = weigh_intensity(color, config.grouping.intensity_weight)
+    signals = build_signals(frame, evidence, config)
     clock.lap("signals")
     edges = detect_edges(signals, config.edges)
     clock.lap("edges")
@@ -105,6 +106,11 @@ def segment(
         seen = signals if surfaces is None else signals.range_only()
         settle_flying(partition, final_models(partition, seen, config)[1], seen, config)
     fill_small_holes(partition, surfaces, config)
+    if evidence is not color:  # the models are of the colour as it was measured
+        misfits = signals.flags & MISFIT
+        signals = build_signals(frame, color, config)
+        np.bitwise_or(signals.flags, misfits, out=signals.flags)
+        partition.forget()
     return conclude(frame, signals, edges, partition, surfaces, config, clock)
 
 

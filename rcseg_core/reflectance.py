@@ -103,3 +103,19 @@ def normalize_reflectance(
 def _median(factors: NDArray[Any]) -> float:
     """The median, or 1 (no correction) where nothing is known."""
     return float(np.median(factors)) if factors.size else 1.0
+
+
+def weigh_intensity(color: NDArray[np.uint8], weight: float) -> NDArray[np.uint8]:
+    """Colour in which differences of brightness count `weight` times as much as those of chromaticity.
+
+    Passive light is not known, so eq. (5) cannot be undone; but a shadow or a gradient of light moves the
+    three channels together, while most changes of albedo do not. Grey levels are pulled towards the middle,
+    what tells the channels apart stays. `color` itself for weight 1.
+    """
+    if weight == 1.0:
+        return color
+    mean = color.mean(axis=2, dtype=np.float32, keepdims=True)
+    weighed: NDArray[np.uint8] = np.clip(np.rint(color + (1.0 - weight) * (127.0 - mean)), 0, 255).astype(
+        np.uint8
+    )
+    return weighed

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from rcseg_core import InputError, PinholeCamera, RangeColorFrame
+from rcseg_core import InputError, PinholeCamera, RangeColorFrame, SegmenterConfig, segment
 from rcseg_core.config import ReflectanceConfig
-from rcseg_core.reflectance import incidence, normalize_reflectance, pixel_normals
+from rcseg_core.reflectance import incidence, normalize_reflectance, pixel_normals, weigh_intensity
 
 SHAPE = (96, 128)
 CAMERA = PinholeCamera(110.0, 110.0, 63.5, 47.5)
@@ -146,3 +146,43 @@ def test_calibration_needs_a_white_frame_of_the_same_size():
     other = RangeColorFrame(np.ones((10, 20, 3)), np.zeros((10, 20, 3), np.uint8), None)
     with pytest.raises(InputError, match="the white-reference frame is 20x10, the frame 128x96"):
         normalize_reflectance(frame, config, other)
+
+
+def two_halves(left, right, seed=0):
+    """A plane whose left and right half have these colours."""
+    rng = np.random.default_rng(seed)
+    color = np.where((np.arange(160) < 80)[None, :, None], left, right) * np.ones((120, 1, 1))
+    color = np.clip(color + rng.normal(0, 2, color.shape), 0, 255).astype(np.uint8)
+    depth_m = 1.5 + 0.001 * rng.normal(size=(120, 160))
+    return RangeColorFrame.from_depth(depth_m, color, PinholeCamera(150.0, 150.0, 79.5, 59.5))
+
+
+def test_a_weight_of_one_is_the_colour_itself():
+    color = np.random.default_rng(0).integers(0, 256, (8, 9, 3)).astype(np.uint8)
+    assert weigh_intensity(color, 1.0) is color
+
+
+def test_brightness_counts_less_and_chromaticity_as_before():
+    color = np.array([[[60, 100, 80], [90, 130, 110], [60, 80, 100]]], np.uint8)
+    weighed = weigh_intensity(color, 0.25).astype(int)
+    # the second pixel is the first with 30 levels more; 30 * 0.25 = 7.5
+    assert np.abs((weighed[0, 1] - weighed[0, 0]) - 7.5).max() <= 1
+    # the third has the mean of the first
+    assert np.array_equal(weighed[0, 2] - weighed[0, 0], [0, -20, 20])
+
+
+@pytest.mark.parametrize("order", ["surfaces_first", "joint"])
+def test_a_shadow_parts_no_region_where_brightness_counts_little(order):
+    shadow, paints = (
+        two_halves((120, 110, 100), (170, 160, 150)),
+        two_halves((120, 110, 100), (100, 110, 180)),
+    )
+    usual = SegmenterConfig().replace({"grouping.order": order})
+    discounted = usual.replace({"grouping.intensity_weight": 0.25})
+    assert segment(shadow, usual).labels.max() == 2
+    result = segment(shadow, discounted)
+    assert result.labels.max() == 1
+    assert segment(paints, usual).labels.max() == segment(paints, discounted).labels.max() == 2
+    # the model is that of the measured colour: its mean is theirs
+    rebuilt = result.reconstruct()[1].astype(float)
+    assert np.abs(rebuilt.mean(axis=(0, 1)) - shadow.color.mean(axis=(0, 1))).max() < 1.5
