@@ -24,6 +24,8 @@ def test_cycles_leave_nothing_behind(live, idle):
     peer, process = idle
     frame = live.scene()
     assert peer.state() == "unconfigured"
+    # its services may be found before its name is
+    live.wait_until(lambda: "idle" in peer.node.get_node_names(), 20)
     topics_before = sorted(peer.node.get_publisher_names_and_types_by_node("idle", "/"))
     for cycle in range(2):
         assert peer.change_state("configure") and peer.state() == "inactive"
