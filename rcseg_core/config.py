@@ -80,11 +80,11 @@ class SignalConfig:
 class NoiseConfig:
     """Sigma_r and Sigma_c of eq. (3)."""
 
-    range_model: Literal["auto", "constant", "kinect_v1", "realsense_d435"] = _param(
+    range_model: Literal["auto", "constant", "law", "kinect_v1", "realsense_d435"] = _param(
         "auto",
         "auto: estimated from each frame as a function of depth; constant: range_sigma at every depth; "
-        "else a sensor",
-        choices=("auto", "constant", "kinect_v1", "realsense_d435"),
+        "law: a + b w + c w^2 of inverse depth w, as `rcseg calibrate` writes it; else a sensor",
+        choices=("auto", "constant", "law", "kinect_v1", "realsense_d435"),
         symbol="Sigma_r",
     )
     range_prior: Literal["none", "kinect_v1", "realsense_d435"] = _param(
@@ -96,6 +96,25 @@ class NoiseConfig:
     range_sigma: float = _param(
         0.002, "standard deviation along depth, for range_model constant", unit="m", low=1e-7, high=1.0
     )
+    range_law_a: float = _param(
+        0.002, "part of the standard deviation of inverse depth that no depth changes, for range_model law",
+        unit="1/m", low=1e-9, high=10.0,
+    )  # fmt: skip
+    range_law_b: float = _param(
+        0.0, "part of it that grows with inverse depth: an error that is a share of depth", low=0.0, high=1.0
+    )
+    range_law_c: float = _param(
+        0.0, "part of it that grows with the square of inverse depth: constant along depth, time of flight",
+        unit="m", low=0.0, high=10.0,
+    )  # fmt: skip
+    range_correlation: float = _param(
+        0.0, "pixels that make one independent measurement of range, 1: white noise; 0: measured from frames",
+        unit="px", low=0.0, high=10000.0,
+    )  # fmt: skip
+    range_systematic: float = _param(
+        -1.0, "part of the range error that no number of pixels averages away; -1: measured from frames",
+        unit="sigma", low=-1.0, high=100.0,
+    )  # fmt: skip
     color_sigma: float = _param(
         0.0,
         "standard deviation of each colour channel; 0: estimated from each frame",
@@ -237,12 +256,12 @@ class GeneralizationConfig:
     )
     test: Literal["guarded", "f"] = _param(
         "guarded",
-        "guarded: nested F test and an effect of at least min_effect; f: the F test alone (the paper)",
+        "guarded: a degree must gain more than correlated and systematic error explain; f: the nested F test "
+        "alone (the paper)",
         choices=("guarded", "f"),
     )
-    alpha: float = _param(0.1, "level of the F test", unit="probability", low=1e-6, high=0.5, symbol="alpha")
-    min_effect: float = _param(
-        0.25, "least fall of the rms residual that justifies a degree", unit="sigma", low=0.0, high=10.0
+    alpha: float = _param(
+        0.1, "level of the F test, for test f", unit="probability", low=1e-6, high=0.5, symbol="alpha"
     )
     creases: bool = _param(
         True, "divide a bent surface where two that meet along a line explain it better (surfaces by range)"
@@ -298,6 +317,115 @@ class BordersConfig:
 
 
 @dataclass(frozen=True)
+class WorldConfig:
+    """What a robot takes from the surfaces: up, classes, ground, polygons, objects (docs/world.md)."""
+
+    up_from: Literal["floor", "parameter", "tf", "imu", "none"] = _param(
+        "floor",
+        "where up is known from; floor: the largest low plane that fits; parameter: up_x, up_y, up_z; tf, "
+        "imu: whoever calls tells it frame by frame (the node does), unknown until then; none: unknown",
+        choices=("floor", "parameter", "tf", "imu", "none"),
+    )
+    up_x: float = _param(
+        0.0, "up in the sensor's frame, of any length, for up_from parameter", low=-1e6, high=1e6
+    )
+    up_y: float = _param(-1.0, "its y; the optical frame's y points down", low=-1e6, high=1e6)
+    up_z: float = _param(0.0, "its z", low=-1e6, high=1e6)
+    up_sigma: float = _param(
+        0.01, "standard deviation of the two tilts of an up that is told without one", unit="rad", low=0.0,
+        high=1.0,
+    )  # fmt: skip
+    horizontal_limit: float = _param(
+        10.0, "planes tilted less than this are horizontal or ceilings, and vertical beside the upright",
+        unit="deg", low=0.1, high=44.0,
+    )  # fmt: skip
+    floor_tolerance: float = _param(
+        0.02, "horizontal planes this near to the floor's own plane are floor", unit="m", low=0.0, high=10.0
+    )
+    tilt_limit: float = _param(
+        2.0, "tilt between told up and seen floor that is named, where it is beyond three deviations too",
+        unit="deg", low=0.0, high=90.0,
+    )  # fmt: skip
+    step_height: float = _param(
+        0.05, "steps up to this can be taken; what stands out from the ground by less is ground", unit="m",
+        low=0.0, high=10.0,
+    )  # fmt: skip
+    slope_limit: float = _param(15.0, "inclines up to this can be taken", unit="deg", low=0.0, high=60.0)
+    polygon_tolerance: float = _param(
+        0.005, "polygons are simplified by at most this distance", unit="m", low=0.0, high=10.0
+    )
+    polygon_least: int = _param(
+        25, "parts and holes of a boundary of fewer pixels are left out", unit="px", low=1, high=1000000
+    )
+    support_area: float = _param(
+        0.35,
+        "horizontal planes larger than this are support, no objects; and planes of any tilt with nothing "
+        "behind them, or of four times this", unit="m^2",
+        low=0.0, high=1e6,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class TrackingConfig:
+    """Names that last from frame to frame; of these, only `stability` changes how a frame is segmented."""
+
+    cell_px: int = _param(
+        6, "side of the squares of pixels of which one is carried from frame to frame", unit="px at 640x480",
+        low=1, high=64,
+    )  # fmt: skip
+    min_overlap: float = _param(
+        0.15, "least intersection over union of the visible part at which a label keeps a name",
+        unit="fraction", low=0.01, high=1.0,
+    )  # fmt: skip
+    depth_tolerance: float = _param(
+        0.04, "by which a carried point may miss the surface it falls on; farther, it is hidden or has gone",
+        unit="fraction of depth", low=0.001, high=1.0,
+    )  # fmt: skip
+    gate: float = _param(
+        1e-5, "probability below which two planes, spheres or cylinders are not the same (chi-squared)",
+        unit="probability", low=1e-12, high=0.5,
+    )  # fmt: skip
+    slack_m: float = _param(
+        0.01, "one sigma of what a surface may move between two frames, beside its errors", unit="m", low=0.0,
+        high=10.0,
+    )  # fmt: skip
+    slack_rad: float = _param(
+        0.01, "one sigma of what a surface may turn between two frames, beside its errors", unit="rad",
+        low=0.0, high=1.0,
+    )  # fmt: skip
+    color_weight: float = _param(
+        0.1, "what equal colour adds to the overlap of two candidates", unit="fraction", low=0.0, high=1.0
+    )
+    pose_sigma_m: float = _param(
+        0.0, "error of the poses that are given, in each direction and independent from frame to frame",
+        unit="m", low=0.0, high=10.0,
+    )  # fmt: skip
+    pose_sigma_rad: float = _param(0.0, "error of their rotation, likewise", unit="rad", low=0.0, high=1.0)
+    margin_px: int = _param(
+        6, "places around a carried point that count too where no motion is known", unit="px at 640x480",
+        low=0, high=100,
+    )  # fmt: skip
+    confirm_frames: int = _param(
+        3, "frames that must show a track before it is confirmed; a tentative one is forgotten when so many "
+        "do not show it", unit="frames", low=1, high=1000,
+    )  # fmt: skip
+    keep_lost_s: float = _param(
+        30.0, "time after which a lost track is forgotten", unit="s", low=0.0, high=1e9
+    )
+    max_lost: int = _param(
+        256, "lost tracks of each kind that are remembered; the longest lost go first", low=0, high=100000
+    )
+    stability: float = _param(
+        0.0, "by how much limits move in favour of what the last frame decided; 0: every frame stands alone",
+        unit="fraction of the limit", low=0.0, high=100.0,
+    )  # fmt: skip
+    max_gap_s: float = _param(
+        1.0, "time without a frame after which all tracks end, unless a pose tells where the sensor went",
+        unit="s", low=0.0, high=1e9,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
 class SegmenterConfig:
     """The whole configuration. Frozen; variants come from `replace`, `from_dict` or `dataclasses.replace`."""
 
@@ -310,6 +438,8 @@ class SegmenterConfig:
     generalization: GeneralizationConfig = GeneralizationConfig()
     absorption: AbsorptionConfig = AbsorptionConfig()
     borders: BordersConfig = BordersConfig()
+    world: WorldConfig = WorldConfig()
+    tracking: TrackingConfig = TrackingConfig()
 
     def __post_init__(self) -> None:
         for parameter in describe(self):
@@ -319,6 +449,9 @@ class SegmenterConfig:
                 f"seeds.min_window = {self.seeds.min_window} is larger than "
                 f"seeds.max_window = {self.seeds.max_window}"
             )
+        up = self.world
+        if up.up_from == "parameter" and not any((up.up_x, up.up_y, up.up_z)):
+            raise ConfigError("world.up_x, up_y, up_z = 0, 0, 0: expected a vector that points somewhere")
 
     @classmethod
     def preset(cls, name: str) -> SegmenterConfig:

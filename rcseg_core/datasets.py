@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import cv2
 import numpy as np
@@ -125,8 +124,14 @@ def load_frames(folder: str | Path, pattern: str = "*") -> Iterator[LabelledFram
         yield load_frame(path, name=name)
 
 
-def load_frame(path: str | Path, *, name: str | None = None) -> LabelledFrame:
+def load_frame(path: str | Path, *, name: str | None = None, depth_unit_m: float = 0.0) -> LabelledFrame:
     """Read one frame: a folder with meta.json, or an .npz file.
+
+    Parameters
+    ----------
+    depth_unit_m : float
+        Metres of one unit of depth or points; 0: what meta.json says, else millimetres of depth in whole
+        numbers (its largest value and 0: none), and metres.
 
     Raises
     ------
@@ -136,19 +141,20 @@ def load_frame(path: str | Path, *, name: str | None = None) -> LabelledFrame:
     path = Path(path)
     name = name or (path.stem if path.is_file() else path.name)
     if path.is_dir():
-        return _read_folder(path, name)
+        return _read_folder(path, name, depth_unit_m)
     if path.suffix != ".npz":
         raise InputError(f"{path}: expected a frame folder (meta.json, depth.png, rgb.png) or an .npz file")
-    return _read_npz(path, name)
+    return _read_npz(path, name, depth_unit_m)
 
 
-def _read_folder(folder: Path, name: str) -> LabelledFrame:
+def _read_folder(folder: Path, name: str, depth_unit_m: float) -> LabelledFrame:
     meta = _read_meta(folder / "meta.json")
     intrinsics = [_number(meta, key, folder) for key in ("fx", "fy", "cx", "cy")]
     raw = _read_image(folder / "depth.png")
     if raw.ndim != 2 or raw.dtype != np.uint16:
         raise InputError(f"{folder / 'depth.png'}: expected a 16-bit image of one channel, got {_what(raw)}")
-    depth_m = raw.astype(np.float32) * np.float32(_number(meta, "depth_unit_m", folder, 0.001))
+    unit_m = depth_unit_m or _number(meta, "depth_unit_m", folder, 0.001)
+    depth_m = raw.astype(np.float32) * np.float32(unit_m)
     depth_m[raw == meta.get("depth_invalid", 0)] = np.nan
     color_path = folder / "rgb.png"
     has_color = color_path.exists()
@@ -158,20 +164,20 @@ def _read_folder(folder: Path, name: str) -> LabelledFrame:
             f"{folder}: depth.png is {raw.shape} and rgb.png is {color.shape[:2]} (rows, columns)"
         )
     truth = _read_truth(folder / "labels.png", raw.shape)
-    with _named(folder):
+    with named(folder):
         frame = RangeColorFrame.from_depth(depth_m, color, PinholeCamera(*intrinsics))
     return LabelledFrame(name, frame, truth, _kind(meta, folder), _background(meta, truth), has_color)
 
 
-def _read_npz(path: Path, name: str) -> LabelledFrame:
+def _read_npz(path: Path, name: str, depth_unit_m: float) -> LabelledFrame:
     """`points` (H, W, 3), or `depth` (H, W) with `K` (3, 3); perhaps `color` (H, W, 3) and `labels` (H, W).
 
     A file with `xyz` instead is SynPEB's: axes x ahead, y left, z up, a spherical grid, labels of planes.
     """
-    arrays = _read_arrays(path)
+    arrays = read_arrays(path)
     synpeb = "xyz" in arrays
     camera = _camera(arrays["K"], path) if "K" in arrays else None
-    points = _points(arrays, camera, path)
+    points = _points(arrays, camera, path, depth_unit_m)
     has_color = "color" in arrays
     color = arrays["color"] if has_color else np.full(points.shape, PLAIN_GREY, np.uint8)
     truth = arrays.get("labels")
@@ -181,36 +187,64 @@ def _read_npz(path: Path, name: str) -> LabelledFrame:
             raise InputError(f"{path}: expected {wanted}, got {_what(truth)}")
         truth = np.where(truth >= SYNPEB_FIRST_PLANE, truth, 0) if synpeb else truth
         truth = truth.astype(np.int32)
-    with _named(path):
+    with named(path):
         return LabelledFrame(name, RangeColorFrame(points, color, camera), truth, REGIONS, (), has_color)
 
 
-def _read_arrays(path: Path) -> dict[str, NDArray[Any]]:
+def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """The arrays of an .npz.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read, is another kind of file or is cut off.
+    """
     try:
-        with np.load(path, allow_pickle=False) as data:
+        data = np.load(path, allow_pickle=False)
+        if not isinstance(data, np.lib.npyio.NpzFile):
+            raise ValueError("a single array, saved by np.save instead of np.savez")
+        with data:
             return {key: data[key] for key in data.files}
-    except (OSError, ValueError, EOFError, AttributeError, BadZipFile) as error:
-        raise InputError(f"{path}: cannot be read as an .npz file ({_first_line(error)})") from error
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: {error.strerror}") from error
+    except Exception as error:  # whatever zipfile, zlib or numpy's own parser stumble over
+        raise InputError(f"{path}: not an .npz archive of arrays ({_first_line(error)})") from error
 
 
-def _points(arrays: dict[str, NDArray[Any]], camera: PinholeCamera | None, path: Path) -> NDArray[Any]:
+def _points(
+    arrays: dict[str, NDArray[Any]], camera: PinholeCamera | None, path: Path, unit_m: float
+) -> NDArray[Any]:
     if "depth" in arrays and "points" not in arrays:
-        if camera is None or arrays["depth"].ndim != 2:
-            raise InputError(f"{path}: a depth (H, W) needs its camera matrix K (3, 3) beside it")
-        return camera.rays(*arrays["depth"].shape) * arrays["depth"][..., None].astype(np.float32)
+        depth = arrays["depth"]
+        if depth.ndim != 2 or depth.dtype.kind not in "fiu" or depth.dtype.itemsize < 2:
+            raise InputError(f"{path}: depth: expected (H, W) of floats or 16-bit steps, got {_what(depth)}")
+        if camera is None:
+            raise InputError(f"{path}: depth needs the camera matrix K, shape (3, 3)")
+        return camera.rays(*depth.shape) * _in_metres(depth, unit_m)[..., None]
     points = arrays.get("points", arrays.get("xyz"))
     if points is None:
         found = ", ".join(arrays) or "nothing"
         raise InputError(f"{path}: expected an array 'points' (H, W, 3), or 'depth' and 'K', found {found}")
     if points.ndim != 3 or points.shape[2] != 3:
         raise InputError(f"{path}: expected points of shape (H, W, 3), got {points.shape}")
+    if unit_m and points.dtype.kind in "fiu":
+        points = points * np.asarray(unit_m, np.result_type(points, np.float32))
     if "points" in arrays:
         return points
     return np.stack([-points[..., 1], -points[..., 2], points[..., 0]], axis=-1)
 
 
+def _in_metres(depth: NDArray[Any], unit_m: float) -> NDArray[np.float32]:
+    """Depth in whole numbers is millimetres, as in depth images, where nothing else is said."""
+    whole = depth.dtype.kind in "iu"
+    depth_m: NDArray[np.float32] = depth.astype(np.float32) * np.float32(unit_m or (0.001 if whole else 1.0))
+    if whole:
+        depth_m[(depth <= 0) | (depth == np.iinfo(depth.dtype).max)] = np.nan
+    return depth_m
+
+
 @contextmanager
-def _named(path: Path) -> Iterator[None]:
+def named(path: Path) -> Iterator[None]:
     """Put the path before the message of an error that knows only the arrays."""
     try:
         yield
@@ -267,7 +301,8 @@ def _read_truth(path: Path, shape: tuple[int, ...]) -> NDArray[np.int32] | None:
 
 
 def _kind(meta: dict[str, Any], folder: Path) -> str:
-    kind = meta.get("truth_kind", OBJECTS)
+    """What a label stands for: `truth_kind` of the meta data, or `truth` for short."""
+    kind = meta.get("truth_kind", meta.get("truth", OBJECTS))
     if kind not in (OBJECTS, REGIONS):
         raise InputError(
             f"{folder / 'meta.json'}: truth_kind must be {OBJECTS!r} or {REGIONS!r}, got {kind!r}"
@@ -287,7 +322,7 @@ def _background(meta: dict[str, Any], truth: NDArray[np.int32] | None) -> tuple[
 def _camera(matrix: NDArray[Any], path: Path) -> PinholeCamera:
     if matrix.shape != (3, 3) or matrix.dtype.kind not in "fiu":
         raise InputError(f"{path}: expected a camera matrix K of shape (3, 3), got {_what(matrix)}")
-    with _named(path):
+    with named(path):
         return PinholeCamera(
             float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2]), float(matrix[1, 2])
         )

@@ -59,8 +59,9 @@ class RangeColorFrame:
 
     Parameters
     ----------
-    points : (H, W, 3) float32 or float64, metres, optical frame
-        NaN, infinite or z = 0 marks an invalid pixel; so does a depth beyond MIN_DEPTH_M and MAX_DEPTH_M.
+    points : (H, W, 3) float32 or float64, metres
+        With a camera in its optical frame, without one in any. NaN, infinity and (0, 0, 0) mark a pixel where
+        nothing was measured; so do values beyond MAX_DEPTH_M and, with a camera, z below MIN_DEPTH_M.
     color : (H, W, 3) uint8, RGB
     camera : PinholeCamera or None
         None for scanner grids: the range signal is then x, y, z.
@@ -98,7 +99,7 @@ class RangeColorFrame:
         object.__setattr__(self, "points", np.require(points, requirements=["C", "W"]))
         object.__setattr__(self, "color", np.require(color, requirements=["C", "W"]))
         if not self.valid.any():
-            raise InputError("no valid pixel: every point is NaN or has z = 0")
+            raise InputError(f"no valid pixel: {self._why_nothing()}")
 
     @classmethod
     def from_depth(
@@ -120,8 +121,9 @@ class RangeColorFrame:
         points = np.empty((height, width, 3), np.float32)
         across, down = camera.rays(1, width)[..., 0], camera.rays(height, 1)[..., 1]
         points[..., 2] = depth_m
-        np.multiply(points[..., 2], across, out=points[..., 0])
-        np.multiply(points[..., 2], down, out=points[..., 1])
+        with np.errstate(invalid="ignore", over="ignore"):  # infinity: beyond all depth, and so invalid
+            np.multiply(points[..., 2], across, out=points[..., 0])
+            np.multiply(points[..., 2], down, out=points[..., 1])
         return cls(points, color, camera)
 
     @property
@@ -134,7 +136,7 @@ class RangeColorFrame:
 
     @property
     def depth_m(self) -> NDArray[Any]:
-        """(H, W) depth along the optical axis, metres; NaN or 0 where invalid."""
+        """(H, W) z of the points: with a camera the depth along its axis, metres; `valid` tells where."""
         return self.points[..., 2]
 
     @cached_property
@@ -144,12 +146,25 @@ class RangeColorFrame:
         # plane by plane: reducing over an axis of three takes ten times as long
         valid: NDArray[np.bool_] = np.isfinite(x) & np.isfinite(y)
         if self.camera is None:
-            valid &= z != 0
+            valid &= np.isfinite(z) & ((x != 0) | (y != 0) | (z != 0))
             for plane in (x, y, z):
                 valid &= np.abs(plane) <= MAX_DEPTH_M
         else:
             valid &= (z >= MIN_DEPTH_M) & (z <= MAX_DEPTH_M)
         return valid
+
+    def _why_nothing(self) -> str:
+        """What the points are, of which none is valid."""
+        finite = np.isfinite(self.points).all(axis=2)
+        measured = int((finite & self.points.any(axis=2)).sum())
+        if not measured:
+            return "every point is NaN, infinite or (0, 0, 0)"
+        if self.camera is not None and not (self.depth_m[finite] > 0).any():
+            return (
+                f"none of the {measured} points lies before the camera (z > 0); give them in the camera's "
+                "optical frame (x right, y down, z ahead), or without a camera"
+            )
+        return f"all {measured} points lie beyond what is metres ({MIN_DEPTH_M:g} to {MAX_DEPTH_M:g} m)"
 
 
 def _size(image: NDArray[Any]) -> str:

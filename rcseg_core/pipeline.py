@@ -2,40 +2,45 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
-from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rcseg_core.config import SegmenterConfig
-from rcseg_core.description import describe_regions
-from rcseg_core.edges import RANGE_EDGES, detect_edges
-from rcseg_core.errors import ConfigError
+from rcseg_core.errors import ConfigError, InputError
 from rcseg_core.frame import RangeColorFrame
-from rcseg_core.partition import Partition, majority
-from rcseg_core.reduction import LEAST_SIDE_PX, at_full_size, reduced, unreduced
-from rcseg_core.reflectance import normalize_reflectance, weigh_intensity
-from rcseg_core.seeds import initial_partition
-from rcseg_core.segmentation import Segmentation
-from rcseg_core.signals import MISFIT, Signals, build_signals
-from rcseg_core.stages import (
-    absorb_points,
-    absorb_small,
-    coarser_merges,
-    divide_creases,
+from rcseg_core.partition.partition import Partition
+from rcseg_core.partition.previous import Previous
+from rcseg_core.partition.seeds import initial_partition
+from rcseg_core.pixels.misfits import mark_misfits
+from rcseg_core.resampling.elsewhere import found_elsewhere
+from rcseg_core.result.segmentation import Segmentation
+from rcseg_core.signal.edges import RANGE_EDGES, detect_edges
+from rcseg_core.signal.noise import NoiseModel
+from rcseg_core.signal.reflectance import normalize_reflectance, weigh_intensity
+from rcseg_core.signal.signals import Signals, build_signals
+from rcseg_core.stages.conclusion import Clock, conclude
+from rcseg_core.stages.linking import (
+    as_measured,
     fill_small_holes,
-    final_models,
-    group_pass,
     link_signals,
-    settle,
     settle_flying,
     sharpen_borders,
-    top_degree,
 )
-from rcseg_core.surfaces import bridge_holes, number_surfaces, surfaces_of
-from rcseg_core.views import carried_back, pinhole_view
+from rcseg_core.stages.measures import final_models
+from rcseg_core.stages.passes import (
+    absorb_points,
+    absorb_small,
+    degrees,
+    divide_creases,
+    group_pass,
+    measured_on_planes,
+    regroup_planes,
+    settle,
+)
+from rcseg_core.stages.surfaces import bridge_holes
 
 #: Made once: every parameter is checked when a configuration is made.
 DEFAULT = SegmenterConfig()
@@ -48,6 +53,7 @@ def segment(
     config: SegmenterConfig | None = None,
     *,
     white_reference: RangeColorFrame | None = None,
+    previous: Previous | None = None,
 ) -> Segmentation:
     """Segment a registered range and colour image into regions of one surface and one colour model.
 
@@ -56,6 +62,8 @@ def segment(
     frame : RangeColorFrame
     config : SegmenterConfig, the defaults if None
     white_reference : RangeColorFrame, only for ``reflectance.mode = calibrated`` (eq. 6)
+    previous : Previous, what the last frame decided as this one shows it, for ``tracking.stability`` above 0;
+        None: the frame stands alone. `rcseg_core.tracking.Segmenter` tells it
 
     Returns
     -------
@@ -69,72 +77,87 @@ def segment(
     config = config or DEFAULT
     if not isinstance(config, SegmenterConfig):
         raise ConfigError(f"config: expected a SegmenterConfig, got {type(config).__name__}")
+    if previous is not None:
+        previous.check(frame.valid.shape)
     clock = Clock()
 
     # 1. normalise the colour (section 3) and find the discontinuities (section 8)
     color = normalize_reflectance(frame, config.reflectance, white_reference)
-    view = pinhole_view(frame, color, config)
-    if view is not None:  # a scanner's grid is segmented as a pinhole camera in its centre would see it
-        result = segment(view.frame, config.replace({"reflectance.mode": "none"}))
-        return carried_back(view, result, frame, color, config)
-    if config.signal.reduction > 1 and min(frame.valid.shape) >= LEAST_SIDE_PX:  # coarse to fine
-        squares = reduced(frame, color, config.signal.reduction)
-        clock.lap("squares")
-        result = at_full_size(frame, color, segment(squares, unreduced(config)), config)
-        return replace(result, timings=clock.seconds | result.timings)
+    result = found_elsewhere(frame, color, config, clock, segment, previous)
+    if result is not None:  # on another image of the scene, where that does better
+        return result
     evidence = weigh_intensity(color, config.grouping.intensity_weight)
-    signals = build_signals(frame, evidence, config)
+    try:
+        signals = build_signals(frame, evidence, config)
+    except ZeroDivisionError:
+        raise InputError(
+            "the frame has no extent: its points lie in one place, or at z = 0 where a sensor model is "
+            "given, so that their noise has no scale"
+        ) from None
     clock.lap("signals")
     edges = detect_edges(signals, config.edges)
     clock.lap("edges")
 
     # 2-8. on both signals jointly; or on the range alone, which gives the surfaces ...
     surfaces: Partition | None = None
+    decided = previous or Previous(None, None)
     if config.grouping.order == "joint":
-        partition = partition_by(signals, edges, config, None, clock, "joint")
+        partition, edges, noise = partition_by(signals, edges, config, None, clock, "joint", decided.labels)
     else:
-        surfaces = partition_by(signals.range_only(), edges & RANGE_EDGES, config, None, clock, "range")
+        ranges = signals.range_only()
+        surfaces, creased, noise = partition_by(
+            ranges, edges & RANGE_EDGES, config, None, clock, "range", decided.surface_labels
+        )
+        edges = edges | creased  # with the creases that were found between surfaces
         partition = surfaces
+        # what fitted nowhere counts for no later fit either
+        mark_misfits(surfaces.labels, surfaces.count, ranges.flags, signals.flags)
+    signals = replace(signals, noise=noise)
 
     # ... then on the colour of each surface; and both decide what small regions and border pixels belong to
     if surfaces is not None and config.grouping.order == "surfaces_first":
         within = bridge_holes(surfaces.labels)
-        partition = partition_by(signals.color_only(), edges, config, within, clock, "color")
+        colors = signals.color_only()
+        partition, _, _ = partition_by(colors, edges, config, within, clock, "color", decided.labels)
+        mark_misfits(partition.labels, partition.count, colors.flags, signals.flags)
         if config.absorption.enabled:
             link_signals(partition, surfaces, signals, edges, config)
     elif config.absorption.enabled:
         seen = signals if surfaces is None else signals.range_only()
         settle_flying(partition, final_models(partition, seen, config)[1], seen, config)
     fill_small_holes(partition, surfaces, config)
-    if evidence is not color:  # the models are of the colour as it was measured
-        misfits = signals.flags & MISFIT
-        signals = build_signals(frame, color, config)
-        np.bitwise_or(signals.flags, misfits, out=signals.flags)
-        partition.forget()
+    clock.lap("link")
+
+    # 9. the models are of the colour as it was measured; patches and coarser levels follow when asked for
+    if evidence is not color:
+        signals = as_measured(frame, color, signals, partition, config)
+        clock.lap("signals")
     return conclude(frame, signals, edges, partition, surfaces, config, clock)
 
 
-def degrees(config: SegmenterConfig, signals: Signals) -> list[int]:
-    """Degrees of the grouping passes; odd ones above 1 add nothing on symmetric patches, so only the paper's
-    own way (each region generalises by itself) walks through them."""
-    top = top_degree(signals, config)
-    ladder = (1, 2, 3, 4) if config.generalization.hypothesis == "region" else (1, 2, 4)
-    return [k for k in ladder if k <= top]
+class Found(NamedTuple):
+    """The regions, the edges with the creases between them, the noise as their residuals tell it."""
+
+    partition: Partition
+    edges: NDArray[np.uint8]
+    noise: NoiseModel
 
 
 def partition_by(
     signals: Signals, edges: NDArray[np.uint8], config: SegmenterConfig, within: NDArray[np.int32] | None,
-    clock: Clock, name: str,
-) -> Partition:  # fmt: skip
+    clock: Clock, name: str, decided: NDArray[np.int32] | None = None,
+) -> Found:  # fmt: skip
     """Steps 2-8 on the channels of `signals`.
 
     Parameters
     ----------
     within : (H, W) int32 or None; regions never cross from one value of it to another
     name : prefix of the stages in `clock`
+    decided : (H, W) int32 or None; regions of the last frame as this one shows them
     """
     # 2. initial partition, bounded by the edges (section 5)
-    partition = Partition(*initial_partition(signals, edges, config.seeds, within), within)
+    favour = 1.0 + config.tracking.stability
+    partition = Partition(*initial_partition(signals, edges, config.seeds, within), within, decided, favour)
     clock.lap(f"{name} seeds")
 
     # 3-4. group planes, the best pair first; then points join the planes that predict them
@@ -144,6 +167,8 @@ def partition_by(
     if config.absorption.enabled:
         absorb_points(partition, signals, models, config)
         clock.lap(f"{name} absorb")
+    if signals.n_range:
+        signals = measured_on_planes(partition, signals, config)
 
     # 5-8. generalise and group on, until no region changes
     divided = int(config.generalization.creases and name == "range")
@@ -153,7 +178,7 @@ def partition_by(
             group_pass(partition, signals, edges, degree, config)
         clock.lap(f"{name} generalize")
         if divided:  # a region may hold two creases
-            divided = divide_creases(partition, signals, edges, config)
+            divided, edges = divide_creases(partition, signals, edges, config)
             clock.lap(f"{name} creases")
         if not config.absorption.enabled:
             break
@@ -162,54 +187,9 @@ def partition_by(
             if within is None:
                 sharpen_borders(partition, partition, models, signals, edges, config)
         if within is None:  # within surfaces, both signals judge small regions later
+            signals = regroup_planes(partition, signals, edges, config)
             absorb_small(partition, signals, edges, config)
         clock.lap(f"{name} absorb")
         if within is not None or partition.count == before:
             break
-    return partition
-
-
-def conclude(
-    frame: RangeColorFrame, signals: Signals, edges: NDArray[np.uint8], partition: Partition,
-    surfaces: Partition | None, config: SegmenterConfig, clock: Clock,
-) -> Segmentation:  # fmt: skip
-    """The result: regions by size with their models; patches and coarser levels follow when asked for."""
-    partition.sort_by_size()
-    moments, models = final_models(partition, signals, config)
-    boxes, pairs = partition.boxes(), partition.pairs(edges, config.grouping.max_gap)
-    if surfaces is None:
-        surface_of = surfaces_of(partition, signals, moments, boxes, pairs, config)
-    else:
-        surface_of = majority(partition, surfaces)
-    surface_labels, surface_of = number_surfaces(partition, surface_of)
-    clock.lap("models")
-    return Segmentation(
-        labels=partition.labels,
-        surface_labels=surface_labels,
-        tree=partition.tree.build(),
-        range_tree=surfaces.tree.build() if surfaces is not None else None,
-        edges=edges,
-        timings=clock.seconds,
-        camera=frame.camera,
-        measure=lambda: (signals, models),
-        leaves=partition.leaves,
-        range_leaves=surfaces.leaves if surfaces is not None else None,
-        nodes=partition.nodes,
-        coarsen=partial(coarser_merges, signals, moments, boxes, pairs, config),
-        describe=partial(
-            describe_regions, frame, signals, partition.labels, surface_of, moments, models, boxes, pairs
-        ),
-    )
-
-
-class Clock:
-    """Seconds by stage."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-        self._last = time.perf_counter()
-
-    def lap(self, stage: str) -> None:
-        now = time.perf_counter()
-        self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self._last
-        self._last = now
+    return Found(partition, edges, signals.noise)

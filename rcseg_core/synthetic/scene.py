@@ -26,6 +26,8 @@ FAMILIES: tuple[str, ...] = tuple(BUILDERS)
 SCANNER_FAMILIES: tuple[str, ...] = ("billiard", "painting")
 REGIONS = (5, 15)
 """Least and largest number of truth regions that matter; other layouts are drawn again."""
+BACKGROUND = ("floor", "wall", "table")
+"""Names of solids that are no objects."""
 AREA_SHARE = 100 / (640 * 480)
 """Hoover's least region area, 100 px at 640 x 480, as a share of the image."""
 
@@ -59,6 +61,7 @@ class SyntheticScene:
         True standard deviation of depth, quantisation included; NaN where the ray meets nothing.
     pose : (4, 4) float64
         Camera to world.
+    background : labels of `object_labels` that are no objects: floor, walls, table
     """
 
     frame: RangeColorFrame
@@ -75,6 +78,7 @@ class SyntheticScene:
     family: str
     seed: int
     pose: Array = field(default_factory=lambda: np.eye(4))
+    background: tuple[int, ...] = ()
 
 
 def make_scene(
@@ -240,6 +244,7 @@ def observe(
         family=family,
         seed=seed,
         pose=pose,
+        background=tuple(i + 1 for i, solid in enumerate(layout.solids) if solid.name in BACKGROUND),
     )
 
 

@@ -67,7 +67,7 @@ def make_tabletop_sequence(
     options = SensorOptions(dropout=0.01, quantization=0.125, shading=True) if options is None else options
     options.check(FAMILY, True)
     rng = np.random.default_rng([seed, *FAMILY.encode()])
-    solids = _table_scene(rng)
+    solids = table_scene(rng)
     start, rise = rng.uniform(-0.2, 0.2) - sweep_rad / 2, rng.uniform(-0.1, 0.15)
     radius, height_m = rng.uniform(0.8, 0.95), TABLE_HEIGHT_M + rng.uniform(0.45, 0.55)
     camera = default_camera(width, height)
@@ -87,7 +87,8 @@ def _orbit(angle: float, radius: float, height_m: float) -> tuple[Array, Array]:
     return camera_rotation(angle, float(pitch), 0.0), position
 
 
-def _table_scene(rng: np.random.Generator) -> list[Solid]:
+def table_scene(rng: np.random.Generator) -> list[Solid]:
+    """Table, floor and wall, then up to three boxes, a cylinder and a ball on the table."""
     top, x, y = np.array([0.0, 0.0, TABLE_HEIGHT_M]), np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])
     solids = [
         Solid(Plane(top, x, y, TABLE_HALF_M), (Paint(random_color(rng)),), "table"),

@@ -1,0 +1,141 @@
+"""Boxes round objects, and what objects stand on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rcseg_core.compute.jit import bare
+from rcseg_core.compute.small import cross, quantile, square_to
+from rcseg_core.shapes.cell_sums import UNUSABLE
+from rcseg_core.signal.signals import INVALID
+from rcseg_core.world.contacts import Links
+from rcseg_core.world.scene import Scene
+from rcseg_core.world.values import Box3d, Up
+
+Array = NDArray[np.float64]
+
+#: Models no farther apart than this share of the distance meet.
+MEETS = 0.03
+#: Cosine between up and the normal of what carries things; least height of a foot that hangs in the air, m.
+FACES_UP, MOST_GAP = 0.8, 0.25
+#: Share of the points that do not count at either end of a box: stray pixels at the rim.
+OUTSIDE = 0.005
+#: Points of an object that tell its box are thinned out to about so many.
+ENOUGH = 1500
+
+
+@bare
+def _gather(points, flags, objects, sound, steps, seen, wait, first, out):  # type: ignore[no-untyped-def]
+    """Every steps[k]-th measured pixel of object k into out, from row first[k] on; seen (K + 1,) counts
+    them, wait (K + 1,) those until the next that is taken."""
+    for row in range(objects.shape[0]):
+        for col in range(objects.shape[1]):
+            k = objects[row, col]
+            if k <= 0 or flags[row, col] & INVALID or (sound[k] and flags[row, col] & UNUSABLE):
+                continue
+            if wait[k] == 0:
+                wait[k] = steps[k]
+                for c in range(3):
+                    out[first[k] + seen[k], c] = points[row, col, c]
+                seen[k] += 1
+            wait[k] -= 1
+
+
+@bare
+def _find_sound(flags, objects, sound):  # type: ignore[no-untyped-def]
+    """sound (K + 1,): whether an object has a pixel that is no outlier."""
+    for row in range(objects.shape[0]):
+        for col in range(objects.shape[1]):
+            if flags[row, col] & UNUSABLE == 0:
+                sound[objects[row, col]] = True
+
+
+def points_of(scene: Scene, objects: NDArray[np.int32], sizes: NDArray[np.int64]) -> list[Array]:
+    """Measured points (n, 3) of objects 0..K, thinned out to some `ENOUGH`; none of 0.
+
+    Pixels in mid-air, which would widen a box, are left out where an object has others.
+
+    sizes : (K + 1,) pixels of each
+    """
+    flags, count = scene.signals.flags, len(sizes)
+    sound = np.zeros(count, np.bool_)
+    _find_sound(flags, objects, sound)
+    steps = np.maximum(sizes // ENOUGH, 1)
+    room = sizes // steps + 1
+    room[0] = 0
+    first = np.concatenate([[0], np.cumsum(room)])
+    taken, wait, out = np.zeros(count, np.int64), np.zeros(count, np.int64), np.empty((first[-1], 3))
+    _gather(scene.points, flags, objects, sound, steps, taken, wait, first, out)
+    return [out[first[k] : first[k] + taken[k]] if taken[k] else np.zeros((1, 3)) for k in range(count)]
+
+
+def box_of(scene: Scene, members: Sequence[int], points: Array, up: Up | None) -> Box3d:
+    """The box round points (n, 3) of some surfaces: upright where up is known, else along their largest
+    plane."""
+    axis = _axis(scene, members, up)
+    first = square_to(axis)
+    frame = np.stack([first, cross(axis, first), axis])
+    local = points @ frame.T
+    low, high = _bounds(local)
+    inner = local[((local >= low) & (local <= high)).all(axis=1)]
+    if len(inner) >= 3:
+        angle = np.deg2rad(cv2.minAreaRect(inner[:, :2].astype(np.float32))[2])
+        turn = np.array([[np.cos(angle), np.sin(angle), 0], [-np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+        frame = turn @ frame
+        low, high = _bounds(local @ turn.T)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = frame.T, frame.T @ (0.5 * (low + high))
+    return Box3d(pose, high - low)
+
+
+def _bounds(local: Array) -> tuple[Array, Array]:
+    """(3,) each: between these all points (n, 3) lie but a share of `OUTSIDE` at either end."""
+    low = int(OUTSIDE * len(local))
+    high = len(local) - 1 - low
+    ordered = np.partition(local, (low, high), axis=0)
+    return ordered[low], ordered[high]
+
+
+def _axis(scene: Scene, members: Sequence[int], up: Up | None) -> Array:
+    if up is not None:
+        return up.vector
+    flat = [s for s in members if scene.planes[s - 1] is not None]
+    if flat:
+        plane = scene.planes[max(flat, key=lambda s: scene.surfaces[s - 1].pixel_count) - 1]
+        assert plane is not None
+        return plane.normal
+    return np.array([0.0, -1.0, 0.0])
+
+
+def stands_on(scene: Scene, members: Sequence[int], points: Array, up: Up | None, links: Links) -> int:
+    """Label of the surface below an object; 0 where up is unknown or none is seen.
+
+    Of the surfaces of others that face up, border on it and lie below its middle: the one that it meets along
+    the longest border; where it hides its own foot, as balls do, the one nearest below.
+    """
+    if up is None:
+        return 0
+    inside = np.zeros(len(scene.surfaces) + 1, np.bool_)
+    inside[list(members)] = True
+    sides = inside[links.surfaces]
+    border = np.flatnonzero(sides[:, 0] != sides[:, 1])
+    own = sides[border, 1].astype(int)
+    other = links.surfaces[border, 1 - own]
+    near = links.apart[border] <= MEETS * np.linalg.norm(links.edge[border, own], axis=1)
+    middle, below = points.mean(axis=0), []
+    foot = middle + quantile((points - middle) @ up.vector, 0.02) * up.vector
+    for s in np.unique(other):
+        plane = scene.planes[s - 1]
+        if plane is None or plane.normal @ up.vector < FACES_UP:
+            continue
+        height = (middle @ plane.normal - plane.distance, foot @ plane.normal - plane.distance)
+        if height[0] > 0.0 and height[1] < height[0]:
+            below.append((-int(near[other == s].sum()), height[1], int(s)))
+    if not below:
+        return 0
+    meeting, gap, best = min(below)
+    return best if meeting < 0 or gap < MOST_GAP else 0
