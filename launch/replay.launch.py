@@ -2,13 +2,16 @@
 
     ros2 launch rcseg_ros replay.launch.py bag:=BAG rate:=0.5 points:=/cloud image:=/rgb camera_info:=/info
 
+RViz is left out, with a word, where it is not installed.
 For results of every frame without a ROS graph, `rcseg replay` is the better tool: nothing is dropped there.
 """
 
+from __future__ import annotations
+
 import os
 
-from ament_index_python.packages import get_package_share_directory
-from launch.actions import DeclareLaunchArgument, ExecuteProcess, IncludeLaunchDescription
+from ament_index_python.packages import get_package_share_directory, get_packages_with_prefixes
+from launch.actions import DeclareLaunchArgument, ExecuteProcess, IncludeLaunchDescription, LogInfo
 from launch.conditions import IfCondition, UnlessCondition
 from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch.substitutions import LaunchConfiguration
@@ -55,12 +58,20 @@ def generate_launch_description() -> LaunchDescription:
             segment,
             ExecuteProcess(cmd=[*play, "--loop"], output="screen", condition=IfCondition(looped)),
             ExecuteProcess(cmd=play, output="screen", condition=UnlessCondition(looped)),
-            Node(
-                package="rviz2",
-                executable="rviz2",
-                arguments=["-d", os.path.join(share, "config", "rcseg.rviz")],
-                parameters=[{"use_sim_time": True}],
-                condition=IfCondition(LaunchConfiguration("rviz")),
-            ),
+            _rviz(share),
         ]
+    )
+
+
+def _rviz(share: str) -> Node | LogInfo:
+    """RViz, or a word where it is missing: a node of no package would end the launch and leave the others."""
+    wanted = IfCondition(LaunchConfiguration("rviz"))
+    if "rviz2" not in get_packages_with_prefixes():
+        return LogInfo(msg="rviz2 is not installed: going on without it", condition=wanted)
+    return Node(
+        package="rviz2",
+        executable="rviz2",
+        arguments=["-d", os.path.join(share, "config", "rcseg.rviz")],
+        parameters=[{"use_sim_time": True}],
+        condition=wanted,
     )

@@ -9,7 +9,7 @@ Every input is an argument; so are the parameter file, autostart, respawn and th
 import os
 
 from ament_index_python.packages import get_package_share_directory
-from launch.actions import DeclareLaunchArgument, SetEnvironmentVariable
+from launch.actions import DeclareLaunchArgument, OpaqueFunction, SetEnvironmentVariable
 from launch.conditions import IfCondition
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import LifecycleNode
@@ -21,8 +21,16 @@ INPUTS = {
     "points": "PointCloud2, organised or (with camera_info) not",
     "depth": "depth Image in place of points (REP 118)",
     "image": "colour Image",
-    "camera_info": "CameraInfo of the pixel grid that both are registered to",
+    "camera_info": "CameraInfo of the pixel grid that both are registered to, or of the colour image",
+    "depth_camera_info": "CameraInfo of a depth Image of another camera than the colour's",
 }
+
+
+def check_config(context) -> None:
+    """Refuse a parameter file that is not there, before anything starts: launch itself would only warn."""
+    path = LaunchConfiguration("config").perform(context)
+    if not os.path.isfile(path):
+        raise RuntimeError(f"config:={path}: no such file; name a parameter file, or leave config away")
 
 
 def generate_launch_description() -> LaunchDescription:
@@ -80,4 +88,4 @@ def generate_launch_description() -> LaunchDescription:
         output="screen",
         emulate_tty=True,
     )
-    return LaunchDescription([*arguments, profile, node])
+    return LaunchDescription([*arguments, OpaqueFunction(function=check_config), profile, node])

@@ -4,6 +4,7 @@ Exit codes: 0; 1 unexpected; 2 bad usage or input, one line on stderr; 130 inter
 readable. Heavy modules are imported inside the commands, so that --help and completion answer at once.
 """
 
+import os
 import sys
 from collections.abc import Sequence
 from enum import Enum
@@ -11,6 +12,10 @@ from pathlib import Path
 from typing import Annotated, Any, Optional
 
 import typer
+
+from rcseg_ros.commands import completion
+from rcseg_ros.commands.signals import taking_signals
+from rcseg_ros.frames.reading import DEFAULT_READING
 
 app = typer.Typer(
     name="rcseg",
@@ -22,6 +27,9 @@ app = typer.Typer(
 )
 
 INTERRUPTED = 130
+
+# What OpenCV finds wrong with a picture stands in our own line.
+os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
 
 
 class Preset(str, Enum):
@@ -43,7 +51,13 @@ Presets = Annotated[
 ]
 Settings = Annotated[
     Optional[list[str]],  # noqa: UP045
-    typer.Option("--set", "-s", metavar="KEY=VALUE", help="One parameter; may be given several times."),
+    typer.Option(
+        "--set",
+        "-s",
+        metavar="KEY=VALUE",
+        help="One parameter; may be given several times.",
+        autocompletion=completion.parameters,
+    ),
 ]
 Force = Annotated[bool, typer.Option("--force", "-f", help="Replace an earlier result of rcseg there.")]
 Output = Annotated[
@@ -51,10 +65,62 @@ Output = Annotated[
     typer.Option("--output", "-o", help="Folder to write; by default NAME_rcseg in this folder."),
 ]
 
+Up = Annotated[
+    str,
+    typer.Option(
+        "--up", metavar="WHAT", show_default=False,
+        help="Which way is up: tf:FRAME (its z axis), imu, imu:TOPIC, X,Y,Z (in the sensor's frame), floor.",
+        autocompletion=completion.one_of(completion.UP),
+    ),
+]  # fmt: skip
+RangeFrom = Annotated[
+    str, typer.Option(help="auto, points or depth.", autocompletion=completion.one_of(completion.RANGE_FROM))
+]
+Images = Annotated[
+    str,
+    typer.Option(
+        help="raw or rectified, where topics do not tell; auto.",
+        autocompletion=completion.one_of(completion.IMAGES),
+    ),
+]
+Families = Annotated[
+    str,
+    typer.Option(
+        help="Synthetic families, separated by commas.",
+        autocompletion=completion.some_of(completion.families),
+    ),
+]
+DepthUnit = Annotated[
+    float,
+    typer.Option("--depth-unit", min=0, help="Metres of one unit of depth; 0: mm of whole numbers, else m."),
+]
+MaxDepth = Annotated[
+    float,
+    typer.Option(
+        "--max-depth", min=0.001, help="Refuse frames whose median depth is beyond, m: a wrong unit."
+    ),
+]
+
+ColorBits = Annotated[
+    int, typer.Option(min=0, max=16, help="Bits used in 16-bit images; 0: as the brightest pixel needs.")
+]
+AssumeRegistered = Annotated[
+    bool, typer.Option("--assume-registered", help="Range and colour pair pixel by pixel in any frames.")
+]
+Slop = Annotated[float, typer.Option(min=0, help="Largest difference of stamps in a pair, ms.")]
+Topics = Annotated[
+    Optional[list[str]],  # noqa: UP045
+    typer.Option(
+        metavar="KEY=TOPIC",
+        autocompletion=completion.one_of(completion.TOPIC_KEYS),
+        help="As of `rcseg replay`.",
+    ),
+]
+
 
 @app.command(epilog="Example: `rcseg replay drive.mcap -o drive_regions --overlays --set grouping.max_gap=2`")
 def replay(
-    bag: Annotated[Path, typer.Argument(help=".mcap file or rosbag2 folder.", show_default=False)],
+    bag: Annotated[Path, typer.Argument(help="rosbag2 folder, .mcap or .db3 file.", show_default=False)],
     output: Output = None,
     preset: Presets = None,
     config: ConfigFile = None,
@@ -63,13 +129,44 @@ def replay(
         Optional[list[str]],  # noqa: UP045
         typer.Option(
             metavar="KEY=TOPIC",
-            help="range=, color= or camera_info=, several separated by commas; KEY=none does without.",
+            autocompletion=completion.one_of(completion.TOPIC_KEYS),
+            help="range=, color=, camera_info= or range_camera_info= (of a depth image of another camera), "
+            "several separated by commas; KEY=none does without.",
         ),
     ] = None,
-    range_from: Annotated[str, typer.Option(help="auto, points or depth.")] = "auto",
-    slop: Annotated[float, typer.Option(min=0, help="Largest difference of stamps in a pair, ms.")] = 20.0,
-    outputs: Annotated[str, typer.Option(help="What to write, separated by commas.")] = "all",
+    range_from: RangeFrom = "auto",
+    depth_unit: DepthUnit = DEFAULT_READING.depth_unit_m,
+    max_depth: MaxDepth = DEFAULT_READING.max_depth_m,
+    color_bits: ColorBits = DEFAULT_READING.color_bits,
+    images: Images = "auto",
+    assume_registered: AssumeRegistered = False,
+    extrinsic: Annotated[
+        str,
+        typer.Option(
+            metavar="X,Y,Z,QX,QY,QZ,QW",
+            help="Where the range's frame stands in the colour image's: metres, quaternion.",
+        ),
+    ] = "",
+    up: Up = "",
+    slop: Slop = 20.0,
+    outputs: Annotated[
+        str,
+        typer.Option(
+            help="What to write, separated by commas; usual: all but clouds of points.",
+            autocompletion=completion.some_of(completion.outputs),
+        ),
+    ] = "usual",
+    track_labels: Annotated[
+        bool, typer.Option("--track-labels", help="Label images hold ids of tracks in place of labels.")
+    ] = False,
+    fixed_frame: Annotated[
+        str,
+        typer.Option(help="Frame in which /tf tells the sensor's pose, for tracks; else nav_msgs/Odometry."),
+    ] = "",
     overlays: Annotated[bool, typer.Option("--overlays", help="Write a PNG of each frame too.")] = False,
+    tables: Annotated[
+        bool, typer.Option("--tables", help="Write Parquet tables of frames, surfaces, regions, labels too.")
+    ] = False,
     force: Force = False,
     workers: Annotated[
         Optional[int],  # noqa: UP045
@@ -78,26 +175,199 @@ def replay(
         ),
     ] = None,
     max_frames: Annotated[Optional[int], typer.Option(min=1, help="Stop after so many.")] = None,  # noqa: UP045
+    verbose: Annotated[
+        bool, typer.Option("--verbose", "-v", help="List every topic, and why it is taken or not.")
+    ] = False,
 ) -> None:
     """Segment a recording: a result bag, metrics.json, config.yaml and a table."""
-    from rcseg_ros.replay import ReplayRequest
+    from rcseg_ros.commands.replay import ReplayRequest
+    from rcseg_ros.commands.terminal import run_replay
+    from rcseg_ros.frames.reading import Reading
+    from rcseg_ros.frames.registration import Surroundings
+    from rcseg_ros.recordings.up import parse_up
     from rcseg_ros.settings import load_config
-    from rcseg_ros.terminal import run_replay
 
+    named = _parse_topics(topics or ())
+    settings, told = parse_up(up, load_config(config, set_ or (), preset))
     request = ReplayRequest(
         bag=bag,
         output=output or Path(f"{bag.absolute().stem}_rcseg"),
-        config=load_config(config, set_ or (), preset),
-        topics=_parse_topics(topics or ()),
-        range_from=_choice("--range-from", range_from, ("auto", "points", "depth")),
+        config=settings,
+        up=told,
+        topics=named,
+        range_from=_choice("--range-from", range_from, completion.RANGE_FROM),
         slop_ns=round(slop * 1e6),
         outputs=_parse_outputs(outputs),
         overlays=overlays,
+        tables=tables,
         force=force,
         workers=workers or 0,
         max_frames=max_frames,
+        reading=Reading(depth_unit, max_depth, color_bits),
+        around=Surroundings(
+            images=_choice("--images", images, completion.IMAGES),
+            assume_registered=assume_registered,
+            extrinsic=_parse_extrinsic(extrinsic),
+            prefer_image="color" in named,
+        ),
+        track_labels=track_labels,
+        fixed_frame=fixed_frame,
     )
-    raise typer.Exit(run_replay(request))
+    raise typer.Exit(run_replay(request, verbose))
+
+
+@app.command(
+    epilog="Examples: `rcseg batch recordings/ -o OUT`, again with more; "
+    "`rcseg batch list.txt -o OUT --shard 3/20`"
+)
+def batch(
+    inputs: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="INPUT...",
+            help="Recordings, folders of such, patterns, URLs, or .txt files with one of these a line.",
+            show_default=False,
+        ),
+    ],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="Folder of the run; given again, it goes on.")
+    ],
+    preset: Presets = None,
+    config: ConfigFile = None,
+    set_: Settings = None,
+    runner: Annotated[
+        str,
+        typer.Option(
+            help="local: processes of this machine; ray: a cluster.",
+            autocompletion=completion.one_of(completion.RUNNERS),
+        ),
+    ] = "local",
+    address: Annotated[
+        str, typer.Option(help="Of the Ray cluster, as ray.init takes it; without one, of this machine.")
+    ] = "",
+    workers: Annotated[
+        int, typer.Option(min=0, max=100_000, help="Units at a time; 0: one for each processor.")
+    ] = 0,
+    memory: Annotated[
+        int, typer.Option(min=0, help="Most that a worker may allocate, MB; what Ray sets aside. 0: any.")
+    ] = 2000,
+    cpus: Annotated[float, typer.Option(min=0.01, help="Processors that Ray sets aside for a unit.")] = 1.0,
+    retries: Annotated[int, typer.Option(min=0, help="How often a unit that failed is tried again.")] = 1,
+    chunk: Annotated[
+        float, typer.Option(min=0, help="Longest unit, s, of recordings with an index; 0: never cut one.")
+    ] = 120.0,
+    shard: Annotated[
+        str, typer.Option(metavar="I/N", help="Only every N-th unit, from the I-th on: for job arrays.")
+    ] = "1/1",
+    tracks: Annotated[
+        bool,
+        typer.Option("--tracks", help="Tables in which surfaces, regions, objects keep their names."),
+    ] = False,
+    bags: Annotated[bool, typer.Option("--bags", help="Write a result bag of each unit too.")] = False,
+    outputs: Annotated[
+        str,
+        typer.Option(
+            help="What is in the bags, separated by commas.",
+            autocompletion=completion.some_of(completion.outputs),
+        ),
+    ] = "usual",
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Say what there is to do, and do nothing.")
+    ] = False,
+    topics: Topics = None,
+    range_from: RangeFrom = "auto",
+    depth_unit: DepthUnit = DEFAULT_READING.depth_unit_m,
+    max_depth: MaxDepth = DEFAULT_READING.max_depth_m,
+    color_bits: ColorBits = DEFAULT_READING.color_bits,
+    images: Images = "auto",
+    assume_registered: AssumeRegistered = False,
+    extrinsic: Annotated[
+        str, typer.Option(metavar="X,Y,Z,QX,QY,QZ,QW", help="As of `rcseg replay`: metres, quaternion.")
+    ] = "",
+    up: Up = "",
+    slop: Slop = 20.0,
+) -> None:
+    """Segment many recordings: Parquet tables, resumed where it stopped. Exit code 3: some units failed."""
+    from rcseg_ros.tables.extras import need_pyarrow
+
+    need_pyarrow()
+    from rcseg_ros.batch.options import BatchOptions
+    from rcseg_ros.batch.report import Runners, run_batch_command
+    from rcseg_ros.batch.run import BatchRequest
+    from rcseg_ros.frames.reading import Reading
+    from rcseg_ros.recordings.up import parse_up
+    from rcseg_ros.settings import load_config
+
+    matrix = _parse_extrinsic(extrinsic)
+    settings, told = parse_up(up, load_config(config, set_ or (), preset))
+    options = BatchOptions(
+        config=settings,
+        topics=tuple(_parse_topics(topics or ()).items()),
+        range_from=_choice("--range-from", range_from, completion.RANGE_FROM),
+        slop_ns=round(slop * 1e6),
+        reading=Reading(depth_unit, max_depth, color_bits),
+        images=_choice("--images", images, completion.IMAGES),
+        assume_registered=assume_registered,
+        extrinsic=() if matrix is None else tuple(matrix.ravel().tolist()),
+        up=told,
+        tracks=tracks,
+        bags=bags,
+        outputs=_parse_outputs(outputs),
+        chunk_s=chunk,
+    )
+    request = BatchRequest(tuple(inputs), output, options, retries, _parse_shard(shard))
+    kind = _choice("--runner", runner, completion.RUNNERS)
+    raise typer.Exit(run_batch_command(request, Runners(kind, address, workers, cpus, memory), dry_run))
+
+
+@app.command(
+    epilog="Example: `rcseg calibrate wall.mcap -o sensor.yaml`, then `rcseg replay BAG --config sensor.yaml`"
+)
+def calibrate(
+    bag: Annotated[Path, typer.Argument(help="rosbag2 folder, .mcap or .db3 file.", show_default=False)],
+    output: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(
+            "--output", "-o", help="File to write, a picture beside it; by default NAME_sensor.yaml here."
+        ),
+    ] = None,
+    topics: Topics = None,
+    range_from: RangeFrom = "auto",
+    depth_unit: DepthUnit = DEFAULT_READING.depth_unit_m,
+    max_depth: MaxDepth = DEFAULT_READING.max_depth_m,
+    images: Images = "auto",
+    assume_registered: AssumeRegistered = False,
+    extrinsic: Annotated[
+        str, typer.Option(metavar="X,Y,Z,QX,QY,QZ,QW", help="As of `rcseg replay`: metres, quaternion.")
+    ] = "",
+    slop: Slop = 20.0,
+    max_frames: Annotated[int, typer.Option(min=1, help="Stop after so many.")] = 100,
+    force: Annotated[bool, typer.Option("--force", "-f", help="Overwrite the file and the picture.")] = False,
+) -> None:
+    """Measure the range error of a sensor on planes: a file for --config, a table, a picture."""
+    from rcseg_ros.commands.calibrate import CalibrateRequest
+    from rcseg_ros.commands.terminal import run_calibrate
+    from rcseg_ros.frames.reading import Reading
+    from rcseg_ros.frames.registration import Surroundings
+
+    named = _parse_topics(topics or ())
+    request = CalibrateRequest(
+        bag=bag,
+        output=output or Path(f"{bag.absolute().stem}_sensor.yaml"),
+        topics=named,
+        range_from=_choice("--range-from", range_from, completion.RANGE_FROM),
+        slop_ns=round(slop * 1e6),
+        max_frames=max_frames,
+        force=force,
+        reading=Reading(depth_unit, max_depth, DEFAULT_READING.color_bits),
+        around=Surroundings(
+            images=_choice("--images", images, completion.IMAGES),
+            assume_registered=assume_registered,
+            extrinsic=_parse_extrinsic(extrinsic),
+            prefer_image="color" in named,
+        ),
+    )
+    raise typer.Exit(run_calibrate(request))
 
 
 @app.command(
@@ -112,7 +382,8 @@ def segment(
     color: Annotated[Optional[Path], typer.Option(help="Colour picture, 8 bit.")] = None,  # noqa: UP045
     depth: Annotated[Optional[Path], typer.Option(help="Depth picture, 16 bit, 0: none.")] = None,  # noqa: UP045
     intrinsics: Annotated[str, typer.Option(metavar="FX,FY,CX,CY", help="Camera, in pixels.")] = "",
-    depth_unit: Annotated[float, typer.Option(min=1e-6, help="Metres of one step of depth.")] = 0.001,
+    depth_unit: DepthUnit = DEFAULT_READING.depth_unit_m,
+    max_depth: MaxDepth = DEFAULT_READING.max_depth_m,
     output: Output = None,
     preset: Presets = None,
     config: ConfigFile = None,
@@ -120,20 +391,20 @@ def segment(
     force: Force = False,
 ) -> None:
     """Segment one frame: labels.png (16 bit), surface_labels.png, overlay.png, regions.json."""
-    from rcseg_ros.segment_one import read_images, read_npz, segment_to_folder
+    from rcseg_ros.commands.segment_one import read_images, read_npz, segment_to_folder
+    from rcseg_ros.commands.terminal import prepare, print_regions
+    from rcseg_ros.frames.reading import Reading
     from rcseg_ros.settings import load_config
-    from rcseg_ros.terminal import prepare, print_regions
 
-    settings = load_config(config, set_ or (), preset)
+    settings, reading = load_config(config, set_ or (), preset), Reading(depth_unit, max_depth)
     if frame is not None and color is None and depth is None:
-        data, name = read_npz(frame), frame.stem
+        data, name = read_npz(frame, reading), frame.stem
     elif frame is None and color is not None and depth is not None and intrinsics:
-        data, name = read_images(color, depth, intrinsics, depth_unit), color.stem
+        data, name = read_images(color, depth, intrinsics, reading), color.stem
     else:
         raise _bad_input("segment: give either FRAME.npz, or --color, --depth and --intrinsics together")
     folder = output or Path(f"{name}_rcseg")
-    prepare(settings)
-    print_regions(segment_to_folder(data, settings, folder, force), folder)
+    print_regions(segment_to_folder(data, settings, folder, force, prepare), folder)
 
 
 @app.command(
@@ -150,8 +421,8 @@ def config(
     force: Annotated[bool, typer.Option("--force", "-f", help="Overwrite the file.")] = False,
 ) -> None:
     """Print every parameter: value, default, unit, bounds, the paper's symbol."""
+    from rcseg_ros.commands.terminal import print_config
     from rcseg_ros.settings import config_yaml, load_config
-    from rcseg_ros.terminal import print_config
 
     settings = load_config(config_file, set_ or (), preset)
     if yaml is None:
@@ -185,7 +456,7 @@ def evaluate(
     preset: Presets = None,
     config: ConfigFile = None,
     set_: Settings = None,
-    families: Annotated[str, typer.Option(help="Synthetic families, separated by commas.")] = "all",
+    families: Families = "all",
     seeds: Annotated[str, typer.Option(help="0-99 are for tuning, 100 and up for reports.")] = "100-109",
     size: Annotated[str, typer.Option(metavar="WIDTHxHEIGHT", help="Of synthetic frames.")] = "640x480",
     outliers: Annotated[float, typer.Option(min=0, max=1, help="Impulse noise, share by signal.")] = 0.0,
@@ -197,9 +468,33 @@ def evaluate(
     labels: Annotated[
         str,
         typer.Option(
-            help="What is judged: regions, surfaces or both; auto: regions of scenes, both of data."
+            help="What is judged: regions, surfaces, both or objects; auto: regions of scenes, both of data.",
+            autocompletion=completion.one_of(completion.LEVELS),
         ),
     ] = "auto",
+    planes: Annotated[
+        bool,
+        typer.Option("--planes", help="Judge recognised planes by the rules of EVOPS (IoU .75)."),
+    ] = False,
+    uncertainty: Annotated[
+        bool,
+        typer.Option("--uncertainty", help="Compare stated errors with the truth of synthetic scenes."),
+    ] = False,
+    tracks: Annotated[
+        bool,
+        typer.Option("--tracks", help="Judge names over time: `synthetic` journeys, or frames in order."),
+    ] = False,
+    frames: Annotated[int, typer.Option(min=1, help="With --tracks, frames of a journey.")] = 60,
+    poses: Annotated[
+        str,
+        typer.Option(
+            help="With --tracks: exact, noisy, none or all.",
+            autocompletion=completion.some_of(completion.poses),
+        ),
+    ] = "all",
+    still: Annotated[bool, typer.Option("--still", help="With --tracks: nothing moves.")] = False,
+    depth_unit: DepthUnit = DEFAULT_READING.depth_unit_m,
+    max_depth: MaxDepth = DEFAULT_READING.max_depth_m,
     tolerance: Annotated[float, typer.Option(help="Overlap of the tables, above 0.5.")] = 0.8,
     pictures: Annotated[bool, typer.Option(help="Write a sheet for each frame, and a page.")] = True,
     tables_only: Annotated[bool, typer.Option("--tables-only", help="Write no files.")] = False,
@@ -215,15 +510,35 @@ def evaluate(
     ] = None,
     force: Force = False,
 ) -> None:
-    """Compare with truth: Hoover's classes, information, parts, reconstruction; tables, files, pictures."""
-    from rcseg_ros.evaluate import run_evaluate
-    from rcseg_ros.evaluate_options import SyntheticOptions, parse_families, parse_seeds, parse_size
-    from rcseg_ros.references import read_reference
+    """Compare with truth: Hoover's classes, information, parts, planes, reconstruction; tables, pictures."""
+    from rcseg_ros.commands.terminal import CONSOLE, prepare, report_faults
+    from rcseg_ros.evaluation.evaluate import run_evaluate
+    from rcseg_ros.evaluation.options import SyntheticOptions, parse_families, parse_seeds, parse_size
+    from rcseg_ros.evaluation.references import read_reference
+    from rcseg_ros.frames.reading import Reading
+    from rcseg_ros.recordings.staging import check_place
     from rcseg_ros.settings import load_config
-    from rcseg_ros.terminal import CONSOLE, prepare, report_faults
 
     settings = load_config(config, set_ or (), preset)
+    if tracks:
+        from rcseg_ros.evaluation.tracks import POSES, TrackOptions, run_evaluate_tracks
+
+        words = POSES if poses == "all" else tuple(poses.split(","))
+        run_evaluate_tracks(
+            dataset,
+            config=settings,
+            console=CONSOLE,
+            warm_up=prepare,
+            output=None if tables_only else output or Path(f"{Path(dataset).absolute().stem}_tracks"),
+            force=force,
+            options=TrackOptions(parse_seeds(seeds), frames, *parse_size(size), words, still),
+            match=match,
+            reading=Reading(depth_unit, max_depth),
+        )
+        return
     file = check or write_reference
+    if write_reference is not None:
+        check_place(write_reference)
     reference = read_reference(file) if file is not None and (check or file.exists()) else None
     folder = output or Path(f"{Path(dataset).absolute().stem}_evaluation")
     scenes = SyntheticOptions(
@@ -247,6 +562,9 @@ def evaluate(
         match=match,
         pictures=pictures,
         reference=reference,
+        planes=planes,
+        uncertainty=uncertainty,
+        reading=Reading(depth_unit, max_depth),
     )
     raise typer.Exit(report_faults(report, reference, check, write_reference))
 
@@ -260,9 +578,7 @@ def bench(
             help="`synthetic` (the default), a frame or a folder of frames; may be given several times.",
         ),
     ] = None,
-    families: Annotated[str, typer.Option(help="Synthetic families, separated by commas.")] = (
-        "room,blocks,curved"
-    ),
+    families: Families = "room,blocks,curved",
     sizes: Annotated[str, typer.Option(metavar="WIDTHxHEIGHT,...", help="Of synthetic frames.")] = (
         "160x120,320x240,640x480,1280x960"
     ),
@@ -289,10 +605,10 @@ def bench(
     force: Force = False,
 ) -> None:
     """Measure speed by stage, memory and first labels, beside other segmenters in the same run."""
-    from rcseg_ros.bench import BenchOptions, parse_sizes, parse_threads
-    from rcseg_ros.evaluate_options import parse_families, parse_seeds
+    from rcseg_ros.bench.run import BenchOptions, parse_sizes, parse_threads
+    from rcseg_ros.commands.terminal import run_bench
+    from rcseg_ros.evaluation.options import parse_families, parse_seeds
     from rcseg_ros.settings import load_config
-    from rcseg_ros.terminal import run_bench
 
     options = BenchOptions(
         sources=tuple(frames or ("synthetic",)),
@@ -315,7 +631,7 @@ def bench(
 )
 def warmup() -> None:
     """Compile all kernels now, and keep them: what starts later is ready within two seconds."""
-    from rcseg_ros.terminal import run_warmup
+    from rcseg_ros.commands.terminal import run_warmup
 
     run_warmup()
 
@@ -324,11 +640,17 @@ def warmup() -> None:
 def inspect(
     result: Annotated[Path, typer.Argument(help="Folder that `rcseg replay` wrote.", show_default=False)],
     frame: Annotated[Optional[int], typer.Option(min=0, help="Show the regions of this frame.")] = None,  # noqa: UP045
+    track: Annotated[Optional[int], typer.Option(min=1, help="Show the life of this track.")] = None,  # noqa: UP045
 ) -> None:
     """Show what a result bag holds, frame by frame, region by region."""
-    from rcseg_ros.inspect import inspect_bag
-    from rcseg_ros.terminal import CONSOLE
+    from rcseg_ros.commands.inspect import inspect_bag
+    from rcseg_ros.commands.terminal import CONSOLE
 
+    if track is not None:
+        from rcseg_ros.commands.inspect_track import inspect_track
+
+        inspect_track(result, track, CONSOLE)
+        return
     inspect_bag(result, frame, CONSOLE)
 
 
@@ -355,16 +677,19 @@ def view(
     ] = 2.0,
     once: Annotated[bool, typer.Option("--once", help="Do not begin again at the end.")] = False,
     node: Annotated[str, typer.Option(help="Name of the node, where its topics lie.")] = "/rcseg",
+    up: Up = "",
     preset: Presets = None,
     config: ConfigFile = None,
     set_: Settings = None,
 ) -> None:
     """Show regions, labels and the reconstruction in a browser, or in Foxglove. Ctrl-C ends it."""
+    from rcseg_ros.commands.terminal import run_view
+    from rcseg_ros.commands.view import ViewRequest
+    from rcseg_ros.recordings.up import parse_up
     from rcseg_ros.settings import load_config
-    from rcseg_ros.terminal import run_view
-    from rcseg_ros.view import ViewRequest
 
-    request = ViewRequest(bag, load_config(config, set_ or (), preset), node, rate, loop=not once)
+    settings, told = parse_up(up, load_config(config, set_ or (), preset))
+    request = ViewRequest(bag, settings, node, rate, loop=not once, up=told)
     raise typer.Exit(run_view(request, host, port, foxglove))
 
 
@@ -384,12 +709,38 @@ def _parse_topics(items: Sequence[str]) -> dict[str, str]:
     return named
 
 
-def _parse_outputs(text: str) -> tuple[str, ...]:
-    from rcseg_ros.segmenting import OUTPUTS
+def _parse_shard(text: str) -> tuple[int, int]:
+    first, slash, step = text.partition("/")
+    if not slash or not (first.isdecimal() and step.isdecimal()) or not 1 <= int(first) <= int(step):
+        raise _bad_input(f"--shard {text}: expected I/N with I from 1 to N, for example 3/20")
+    return int(first), int(step)
 
-    if text == "all":
-        return OUTPUTS
-    return tuple(_choice("--outputs", name.strip(), OUTPUTS) for name in text.split(","))
+
+def _parse_extrinsic(text: str) -> Any:
+    import numpy as np
+
+    from rcseg_ros.frames.extrinsic import rigid
+
+    if not text:
+        return None
+    try:
+        numbers = [float(number) for number in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) != 7 or not np.isfinite(numbers).all() or not any(numbers[3:]):
+        raise _bad_input(
+            f"--extrinsic {text}: expected X,Y,Z,QX,QY,QZ,QW, in metres and a quaternion that is not zero"
+        )
+    matrix = rigid(numbers[:3], numbers[3:])
+    return np.eye(4) if matrix is None else matrix  # two sensors in one place, which was said
+
+
+def _parse_outputs(text: str) -> tuple[str, ...]:
+    from rcseg_ros.recordings.segmenting import CLOUDS, OUTPUTS
+
+    known = {"all": (*OUTPUTS, *CLOUDS), "usual": OUTPUTS} | {name: (name,) for name in (*OUTPUTS, *CLOUDS)}
+    names = [_choice("--outputs", name.strip(), list(known)) for name in text.split(",")]
+    return tuple(dict.fromkeys(output for name in names for output in known[name]))
 
 
 def _choice(option: str, value: str, choices: Sequence[str]) -> str:
@@ -400,6 +751,11 @@ def _choice(option: str, value: str, choices: Sequence[str]) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit code."""
+    with taking_signals():
+        return _run(arguments)
+
+
+def _run(arguments: Sequence[str] | None) -> int:
     try:
         code = app(args=arguments, prog_name="rcseg", standalone_mode=False)
     except (KeyboardInterrupt, typer.Abort):

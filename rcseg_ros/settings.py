@@ -12,6 +12,7 @@ import yaml
 from rcseg_core import SegmenterConfig
 from rcseg_core.config import Parameter, describe
 from rcseg_core.errors import ConfigError, InputError
+from rcseg_ros.frames.expansion import load_yaml
 
 
 def load_config(path: Path | None, settings: Sequence[str], preset: str | None = None) -> SegmenterConfig:
@@ -51,7 +52,7 @@ def load_config(path: Path | None, settings: Sequence[str], preset: str | None =
 def _read(path: Path) -> tuple[dict[str, Any], Any]:
     """Groups of a file, and the preset that it names or None."""
     try:
-        nested = yaml.safe_load(path.read_text("utf-8"))
+        nested = load_yaml(path.read_text("utf-8"))
     except OSError as error:
         raise InputError(f"{path}: {error.strerror}") from None
     except (yaml.YAMLError, UnicodeDecodeError) as error:

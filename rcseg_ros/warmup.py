@@ -20,10 +20,14 @@ from typing import Any
 import numpy as np
 
 from rcseg_core import PinholeCamera, RangeColorFrame, SegmenterConfig, segment
+from rcseg_core.compute.jit import cache_folder
+from rcseg_core.compute.parallel import LEAST_ROWS
 from rcseg_core.config import PRESETS, describe
 from rcseg_core.errors import InputError
-from rcseg_core.jit import cache_folder
-from rcseg_ros.messages import region_array
+from rcseg_core.registration import render_depth
+from rcseg_core.result.seen import region_areas
+from rcseg_core.tracking import Tracker
+from rcseg_ros.results.messages import region_array
 
 _PATIENCE_S, _BEAT_S = 3.0, 10.0
 #: Numbers that switch something on or off; choices and switches themselves are all tried.
@@ -158,10 +162,15 @@ def _cases() -> Iterator[tuple[str, Callable[[], RangeColorFrame], SegmenterConf
 
 def _use(frame: RangeColorFrame, config: SegmenterConfig) -> None:
     """Everything that commands and the node ask of a frame and that takes kernels."""
+    render_depth(frame.points, frame.camera or PinholeCamera(1.0, 1.0, 0.0, 0.0), frame.height, frame.width)
     result = segment(frame, config)
+    region_areas(frame, result.labels, result.regions)
     region_array(frame, result, None, lambda type_name, /, **fields: SimpleNamespace(**fields))
     result.labels_at(0.5)
     result.labels_at(2.0)
+    tracker = Tracker(config)
+    for stamp_ns, pose in ((0, None), (1, None), (2, np.eye(4))):
+        tracker.update(result, stamp_ns, pose)
 
 
 def _precise() -> RangeColorFrame:
@@ -170,8 +179,11 @@ def _precise() -> RangeColorFrame:
 
 
 def _small_scene() -> RangeColorFrame:
-    """Two walls and a ball of different colours, with noise and a hole: every stage has something to do."""
-    rows, cols = np.mgrid[0:96, 0:128]
+    """Two walls and a ball of different colours, with noise and a hole: every stage has something to do.
+
+    As high as images are that several threads share, which some kernels are for.
+    """
+    rows, cols = np.mgrid[0 : max(96, LEAST_ROWS + 4), 0:128]
     depth_m = np.where(cols < 64, 1.5, 1.5 + 0.004 * (cols - 64)).astype(np.float32)
     bulge = 20.0**2 - (rows - 48.0) ** 2 - (cols - 40.0) ** 2
     ball = bulge > 0

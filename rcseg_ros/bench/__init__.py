@@ -1,0 +1,4 @@
+"""`rcseg bench`: time, memory and accuracy of presets and peers in one run.
+
+Needs no ROS. May import: `evaluation` for its figures and tables. For others: `run`, `report`.
+"""
