@@ -2,19 +2,32 @@
 
 import numpy as np
 
-from rcseg_core.noise import NoiseModel
-from rcseg_core.signals import Signals
+from rcseg_core.signal.noise import NoiseModel
+from rcseg_core.signal.signals import Signals
 
 
 def crafted_signals(
-    image, n_range=1, *, flags=None, eps=0.0, color_eps=0.0, inverse_depth=True, correlation=1.0
+    image,
+    n_range=1,
+    *,
+    flags=None,
+    eps=0.0,
+    color_eps=0.0,
+    inverse_depth=True,
+    correlation=1.0,
+    systematic=0.0,
 ):
     """Signals of a whitened (H, W, C) image: unit noise everywhere, tolerances in sigmas, unit scales."""
     image = np.ascontiguousarray(image, np.float32)
     channels = image.shape[2]
     flags = np.zeros(image.shape[:2], np.uint8) if flags is None else flags.astype(np.uint8)
     noise = NoiseModel(
-        np.array([[1.0, 0.0, 0.0]] * max(n_range, 1)), np.ones(3), correlation, correlation, "by hand"
+        np.array([[1.0, 0.0, 0.0]] * max(n_range, 1)),
+        np.ones(3),
+        correlation,
+        correlation,
+        "by hand",
+        systematic,
     )
     return Signals(
         image=image,

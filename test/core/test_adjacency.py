@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracle import naive_graph
 
-from rcseg_core.adjacency import find_pairs, spread
+from rcseg_core.graph.adjacency import find_pairs, spread
 
 
 def random_image(seed, shape=(17, 23), count=5):

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from oracle import naive_patch
 
-from rcseg_core.bezier import (
+from rcseg_core.models.bezier import (
     BezierPatch,
     basis,
     bernstein,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rcseg_core import PinholeCamera, RangeColorFrame
-from rcseg_core.blobs import find_blobs
+from rcseg_core.evaluation.blobs import find_blobs
 
 HEIGHT, WIDTH = 120, 160
 CAMERA = PinholeCamera(150.0, 150.0, 79.5, 59.5)

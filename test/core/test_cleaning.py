@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rcseg_core.cleaning import LINEAR_GAP_PX, color_median, fill_rows, local_median
+from rcseg_core.signal.cleaning import LINEAR_GAP_PX, color_median, fill_rows, local_median
 
 
 def filled(image, valid):

@@ -40,13 +40,23 @@ def legal(parameter):
     return st.floats(parameter.low, parameter.high)
 
 
-configs = st.fixed_dictionaries({}, optional={key: legal(p) for key, p in PARAMETERS.items()}).map(
-    lambda changes: (
-        changes
-        if changes.get("seeds.min_window", 3) <= changes.get("seeds.max_window", 11)
-        else {k: v for k, v in changes.items() if not k.startswith("seeds.m")}
-    )
-)
+def together(changes):
+    """Without what is refused although each value is within its bounds."""
+    if changes.get("seeds.min_window", 3) > changes.get("seeds.max_window", 11):
+        changes = {k: v for k, v in changes.items() if not k.startswith("seeds.m")}
+    if not any(changes.get(f"world.up_{axis}", float(axis == "y")) for axis in "xyz"):
+        changes = changes | {"world.up_from": "floor"}
+    return changes
+
+
+configs = st.fixed_dictionaries({}, optional={key: legal(p) for key, p in PARAMETERS.items()}).map(together)
+
+
+def test_an_up_that_points_nowhere_is_refused_where_it_is_used():
+    zero = {f"world.up_{axis}": 0.0 for axis in "xyz"}
+    SegmenterConfig().replace(zero)
+    with pytest.raises(ConfigError, match=r"world\.up_x"):
+        SegmenterConfig().replace({**zero, "world.up_from": "parameter"})
 
 
 def test_every_parameter_is_described():

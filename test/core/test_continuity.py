@@ -5,10 +5,11 @@ import pytest
 from crafted import crafted_signals
 from oracle.naive_growth import predict as direct
 
-from rcseg_core.adjacency import find_pairs
-from rcseg_core.continuity import continuous_pairs, tangent
-from rcseg_core.models import fit_models
-from rcseg_core.moments import UNIT_PX, accumulate
+from rcseg_core.graph.adjacency import find_pairs
+from rcseg_core.graph.continuity import continuous_pairs, tangent
+from rcseg_core.models.moments import accumulate
+from rcseg_core.models.polynomials import fit_models
+from rcseg_core.signal.units import UNIT_PX
 
 SHAPE = (48, 64)
 ROWS, COLS = np.mgrid[: SHAPE[0], : SHAPE[1]]
@@ -61,11 +62,10 @@ def bend(degrees):
     return np.maximum(COLS - 43.5, 0) * np.tan(np.deg2rad(degrees)) * 10.0 / UNIT_PX
 
 
-def test_flat_parts_continue_where_they_turn_a_little():
-    """The corner of a table that the sensor's distortion bends."""
-    assert joined(bend(12.0), curved=FLAT, degree=1) == [[1, 2]]
-    assert joined(bend(24.0), curved=FLAT, degree=1) == []
-    assert joined(bend(24.0), degree=1) == [[1, 2]]  # curved ones may turn further
+def test_flat_parts_are_left_to_the_criterion_of_grouping():
+    """It knows how much a sensor bends planes; curved ones continue each other where they turn a little."""
+    assert joined(bend(12.0), curved=FLAT, degree=1) == []
+    assert joined(bend(24.0), degree=1) == [[1, 2]]
 
 
 def test_an_edge_along_the_border_parts_flat_parts():

@@ -51,6 +51,15 @@ def test_depth_units_and_invalid_values_come_from_the_meta_data(tmp_path):
     assert not frame.valid[2, 2]
 
 
+def test_an_npz_of_whole_numbers_is_millimetres_and_its_largest_number_is_no_depth(tmp_path):
+    depth = np.full((12, 16), 1500, np.uint16)
+    depth[0, 0], depth[1, 1] = 0, 65535
+    np.savez(tmp_path / "a.npz", depth=depth, K=np.array([[100.0, 0, 7.5], [0, 100, 5.5], [0, 0, 1]]))
+    frame = load_frame(tmp_path / "a.npz").frame
+    assert frame.depth_m[5, 5] == pytest.approx(1.5)
+    assert not frame.valid[0, 0] and not frame.valid[1, 1] and frame.valid.sum() == 12 * 16 - 2
+
+
 def test_truth_of_mosd_knows_its_table(tmp_path):
     labels = np.full((12, 16), 20, np.uint8)
     meta = {**META, "source": "github PointCloudLibrary/data@5c26bdd segmentation/mOSD/learn/learn2.pcd"}
@@ -59,6 +68,8 @@ def test_truth_of_mosd_knows_its_table(tmp_path):
     frame = load_frame(write_frame(tmp_path / "b", meta, labels=labels))
     assert frame.background == (4,)
     assert frame.kind == REGIONS
+    short = load_frame(write_frame(tmp_path / "c", {**META, "truth": "regions"}, labels=labels))
+    assert short.kind == REGIONS, "the short name of the same key"
 
 
 def test_without_colour_and_truth_the_frame_is_grey_and_says_so(tmp_path):
@@ -167,7 +178,7 @@ def test_a_spoilt_frame_is_one_clear_line_with_its_path(tmp_path, what, text):
     [
         ({"cloud": np.ones((4, 4, 3))}, "found cloud"),
         ({"points": np.ones((4, 4))}, "shape (H, W, 3), got (4, 4)"),
-        ({"depth": np.ones((4, 4))}, "needs its camera matrix K"),
+        ({"depth": np.ones((4, 4))}, "needs the camera matrix K"),
         ({"points": np.ones((4, 4, 3)), "K": np.ones(4)}, "K of shape (3, 3)"),
         ({"points": np.ones((4, 4, 3)), "labels": np.ones((4, 4))}, "integer labels"),
         ({"points": np.ones((4, 4, 3)), "color": np.ones((4, 4, 3))}, "expected uint8 RGB"),
@@ -186,7 +197,7 @@ def test_a_truncated_npz_is_said(tmp_path):
     path = tmp_path / "x.npz"
     np.savez(path, points=np.ones((40, 40, 3)))
     path.write_bytes(path.read_bytes()[:500])
-    with pytest.raises(InputError, match=r"x\.npz: cannot be read as an \.npz file"):
+    with pytest.raises(InputError, match=r"x\.npz: not an \.npz archive of arrays"):
         load_frame(path)
 
 

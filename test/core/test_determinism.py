@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rcseg_core import SegmenterConfig, parallel, segment
+from rcseg_core import SegmenterConfig, segment
+from rcseg_core.compute import parallel
 from rcseg_core.synthetic import make_scene
 
 REPOSITORY = Path(__file__).resolve().parents[2]

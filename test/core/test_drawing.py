@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from rcseg_core import drawing
 from rcseg_core.errors import InputError
+from rcseg_core.result import drawing
 
 
 def two_labels():
@@ -52,20 +52,63 @@ def test_overlay_blends_and_draws_white_boundaries():
     assert (color == 100).all()
 
 
+def naive_boundaries(labels):
+    """Pixel by pixel: the next labelled pixel to the right or below, over one hole at most, is another's."""
+    height, width = labels.shape
+    edge = np.zeros((height, width), bool)
+    for row in range(height):
+        for col in range(width):
+            for down, right in ((0, 1), (1, 0)):
+                ahead = [
+                    labels[row + step * down, col + step * right]
+                    for step in (1, 2)
+                    if row + step * down < height and col + step * right < width
+                ]
+                other = next((label for label in ahead if label), 0)
+                edge[row, col] |= labels[row, col] > 0 and other > 0 and other != labels[row, col]
+    return edge
+
+
+def test_missing_pixels_have_no_borders_and_break_none():
+    rng = np.random.default_rng(3)
+    labels = two_labels()
+    whole = drawing.boundaries(labels)
+    labels[rng.random(labels.shape) < 0.2] = 0
+    found = drawing.boundaries(labels)
+    assert (found == naive_boundaries(labels)).all()
+    one = np.where(labels > 0, 1, 0)
+    assert not drawing.boundaries(one).any()
+    color = np.full((*labels.shape, 3), 100, np.uint8)
+    white = (drawing.overlay(color, one) == 255).all(axis=2)
+    assert not white.any()
+    assert 0.8 * whole.sum() < found.sum() < 1.2 * whole.sum()
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 5), (5, 1), (2, 2), (7, 9)])
+def test_boundaries_of_small_and_random_images(shape):
+    labels = np.random.default_rng(1).integers(0, 4, shape).astype(np.uint16)
+    assert (drawing.boundaries(labels) == naive_boundaries(labels)).all()
+
+
 def test_overlay_of_images_that_do_not_fit_is_refused():
     with pytest.raises(InputError, match="overlay"):
         drawing.overlay(np.zeros((4, 5, 3), np.uint8), np.zeros((5, 4), np.int32))
 
 
-def test_overlay_keeps_up_with_a_camera():
+@pytest.mark.alone
+def test_an_overlay_costs_less_than_a_boolean_index_of_the_image():
+    """In the same run, since machines differ: an overlay is .3 to .5 of it."""
     labels = np.random.default_rng(0).integers(0, 50, (12, 16)).repeat(40, 0).repeat(40, 1).astype(np.int32)
     color = np.zeros((480, 640, 3), np.uint8)
-    times = []
+    times = {"overlay": [], "index": []}
     for _ in range(15):
         start = perf_counter()
         drawing.overlay(color, labels)
-        times.append(perf_counter() - start)
-    assert min(times) < 0.005
+        middle = perf_counter()
+        color[labels > 3]
+        times["overlay"].append(middle - start)
+        times["index"].append(perf_counter() - middle)
+    assert min(times["overlay"]) < min(times["index"])
 
 
 def test_edge_bits_have_their_colours():
@@ -118,8 +161,8 @@ def test_surfaces_are_painted_by_their_kind():
     labels = np.zeros((6, 9), np.int32)
     labels[:, 3:6], labels[:, 6:] = 1, 2
     picture = drawing.kinds_picture(labels, ["sphere", "none"])
-    assert (picture[:, :2] == 0).all()
+    assert (picture[:, :3] == 0).all()
     assert (picture[:, 3:5] == drawing.KIND_COLORS["sphere"]).all() and (
         picture[:, 6:] == drawing.KIND_COLORS["none"]
     ).all()
-    assert (picture[:, [2, 5]] == drawing.BOUNDARY_COLOR).all()
+    assert (picture[:, 5] == drawing.BOUNDARY_COLOR).all()

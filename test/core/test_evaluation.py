@@ -10,18 +10,20 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from oracle import naive_hoover
 
-from rcseg_core import agreement
 from rcseg_core.datasets import LabelledFrame
 from rcseg_core.errors import InputError
-from rcseg_core.evaluation import (
+from rcseg_core.evaluation import agreement
+from rcseg_core.evaluation.frames import (
+    choose_labels,
     evaluate_frame,
     evaluate_labels,
     evaluate_parts,
     evaluate_reconstruction,
     evaluate_scene,
+    one_background,
 )
-from rcseg_core.hoover import contingency
-from rcseg_core.pooling import pool
+from rcseg_core.evaluation.hoover import contingency
+from rcseg_core.evaluation.pooling import pool
 from rcseg_core.synthetic import make_scene
 
 labels_image = arrays(np.int32, (6, 7), elements=st.integers(0, 3))
@@ -262,12 +264,27 @@ def test_the_kind_of_truth_decides_the_figures(scene):
     metrics = evaluate_frame(replace(frame, kind="regions", truth=scene.labels), result, level="regions")
     assert metrics.parts is None
     assert metrics.labels.at().missed == 0
+    assert metrics.row()["missed"] == 0 and metrics.row()["correct"] == metrics.labels.at().correct > 10
     metrics = evaluate_frame(replace(frame, truth=None), result)
-    assert metrics.labels is None
+    assert metrics.labels is None and "missed" not in metrics.row()
     assert metrics.parts is None
     assert metrics.labelled == 1
-    with pytest.raises(InputError, match="'regions' or 'surfaces'"):
+    with pytest.raises(InputError, match="'surfaces' or 'objects'"):
         evaluate_frame(frame, result, level="colours")
+
+
+def test_objects_are_compared_with_one_background():
+    """Walls and floor are one label on both sides; half of one of two objects is lost to it."""
+    truth = np.array([[1, 1, 2, 2, 3, 3, 4, 4]] * 8, np.int32)
+    machine = np.array([[0, 0, 0, 0, 1, 1, 2, 0]] * 8, np.int32)
+    result = SimpleNamespace(labels=truth, surface_labels=truth, object_labels=machine)
+    labels = choose_labels(result, "objects")
+    assert labels[0].tolist() == [3, 3, 3, 3, 1, 1, 2, 3]
+    single, background = one_background(truth, (1, 2))
+    assert single[0].tolist() == [1, 1, 1, 1, 3, 3, 4, 4] and background == (1,)
+    parts = evaluate_parts(single, labels, background=background, minimum_area=1)
+    assert parts.objects == 2 and parts.best_iou == pytest.approx(0.75) and parts.whole == 0.5
+    assert one_background(truth, ())[1] == ()
 
 
 # ---- pooling

@@ -8,7 +8,7 @@ from hypothesis.extra.numpy import arrays
 from oracle import naive_hoover
 
 from rcseg_core.errors import InputError
-from rcseg_core.hoover import TOLERANCES, classify, contingency, sweep
+from rcseg_core.evaluation.hoover import TOLERANCES, classify, contingency, sweep
 
 labels_image = arrays(np.int32, (6, 7), elements=st.integers(0, 4))
 

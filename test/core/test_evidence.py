@@ -6,7 +6,7 @@ from crafted import crafted_signals
 from oracle import naive_graph, naive_patch
 
 from rcseg_core.config import SegmenterConfig
-from rcseg_core.evidence import (
+from rcseg_core.decision.evidence import (
     POINTS,
     compare,
     compare_planes,
@@ -15,13 +15,19 @@ from rcseg_core.evidence import (
     own_residuals,
     trace_inverse,
 )
-from rcseg_core.moments import UNIT_PX, accumulate, region_boxes, tensor_exponents
-from rcseg_core.planes import center_planes
-from rcseg_core.signals import local_scales
-from rcseg_core.stages import make_rule
+from rcseg_core.models.moments import accumulate, region_boxes, tensor_exponents
+from rcseg_core.models.planes import center_planes
+from rcseg_core.signal.signals import LEAST_SIGMA, local_scales
+from rcseg_core.signal.units import UNIT_PX
+from rcseg_core.stages.measures import make_rule
 
 SHAPE = (40, 60)
 EPS, COLOR_EPS = 1.5, 3.0
+#: Pixels of an independent measurement; systematic part of the error of range and of colour (the default).
+CORRELATION, SYSTEMATIC, COLOR_SYSTEMATIC = 1.5, 0.3, SegmenterConfig().grouping.noise_share
+#: What the variance of the range noise may be off by is no evidence either.
+KNOWN_VARIANCE = 0.03
+ERRORS = ((CORRELATION, SYSTEMATIC**2 + KNOWN_VARIANCE), (CORRELATION, COLOR_SYSTEMATIC**2))
 
 
 def scene(seed=0, bend=0.0, step=0.0, n_range=1):
@@ -35,7 +41,8 @@ def scene(seed=0, bend=0.0, step=0.0, n_range=1):
     image = smooth[..., None] * np.linspace(1, 0.5, n_range + 3) + rng.normal(size=(*SHAPE, n_range + 3))
     image[labels == 2] += step
     flags = np.where(rng.random(SHAPE) < 0.1, 2, 0)
-    return crafted_signals(image, n_range, flags=flags, eps=EPS, color_eps=COLOR_EPS), labels
+    changes = {"correlation": CORRELATION, "systematic": SYSTEMATIC}
+    return crafted_signals(image, n_range, flags=flags, eps=EPS, color_eps=COLOR_EPS, **changes), labels
 
 
 def prepared(signals, labels, degrees=(1, 1), planes=False, **changes):
@@ -60,7 +67,7 @@ def compared(signals, labels, degrees=(1, 1), gates=(1.0, 1.0), kind=None, order
     if kind is not None:
         rule = rule._replace(kind=kind)
     boxes = region_boxes(labels, int(labels.max()))
-    return compare(moments, *order, rule, own, boxes, *gates, work), pixels, rule
+    return compare(moments, *order, rule, own, boxes, *gates, 1.0, work), pixels, rule
 
 
 def bounded_by_hand(pixels, exponents, rule, gates, whole=False):
@@ -68,12 +75,11 @@ def bounded_by_hand(pixels, exponents, rule, gates, whole=False):
     x, y, values, label = pixels
     everything, ratio, need = np.ones(label.size, bool), 0.0, 0.0
     n_range = rule.n_range
-    for channels, eps2, gate in (
-        (slice(0, n_range), EPS**2, gates[0]),
-        (slice(n_range, None), COLOR_EPS**2, gates[1]),
+    for channels, eps2, gate, error in (
+        (slice(0, n_range), EPS**2, gates[0], ERRORS[0]),
+        (slice(n_range, None), COLOR_EPS**2, gates[1], ERRORS[1]),
     ):
         p = len(exponents) * values[:, channels].shape[1]
-        noise = p + 4 * np.sqrt(2 * p)
         rises, sizes = [], []
         for side in (1, 2):
             rises.append(naive_patch.rise(x, y, values[:, channels], label == side, exponents, everything))
@@ -81,7 +87,7 @@ def bounded_by_hand(pixels, exponents, rule, gates, whole=False):
         if whole:
             rises, sizes = [sum(rises)], [sum(sizes)]
         for rise, n in zip(rises, sizes, strict=True):
-            allowance, budget = noise + n * rule.share2, n * eps2 * gate**2
+            allowance, budget = naive_graph.error_gain(*error, n, p), n * eps2 * gate**2
             ratio = max(ratio, rise / (allowance + budget))
             need = max(need, np.sqrt(max(rise - allowance, 0) / budget))
     return ratio, need
@@ -108,14 +114,14 @@ def test_planes_are_compared_alike_in_closed_form(criterion, step):
     moments, rule, _, _, pixels = prepared(signals, labels, planes=True, **{"grouping.criterion": criterion})
     gates = (0.8, 0.6)
     shape, signal = np.empty(6), np.empty((4, 5))
-    value, height, allowed = compare_planes(center_planes(moments), 1, 2, rule, *gates, shape, signal)
+    value, height, allowed = compare_planes(center_planes(moments), 1, 2, rule, *gates, 1.0, shape, signal)
     wanted = bounded_by_hand(pixels, [(0, 0), (1, 0), (0, 1)], rule, gates, criterion == "chow")
     assert (value, height) == pytest.approx(wanted, rel=1e-6, abs=1e-6)
     assert allowed == (value <= 1)
     x, y, values, label = pixels
     ratio = naive_graph.plane_ratio(
-        x, y, values, label == 1, label == 2, 1, [3 + 4 * 6**0.5, 9 + 4 * 18**0.5],
-        [rule.share2 + (EPS * gates[0]) ** 2, rule.share2 + (COLOR_EPS * gates[1]) ** 2], criterion == "chow",
+        x, y, values, label == 1, label == 2, 1, ERRORS,
+        [(EPS * gates[0]) ** 2, (COLOR_EPS * gates[1]) ** 2], criterion == "chow",
     )  # fmt: skip
     assert value == pytest.approx(ratio, rel=1e-6, abs=1e-6)
 
@@ -216,7 +222,8 @@ def test_tolerance_is_earned_by_relief():
 def test_noise_and_tolerance_depend_on_depth_as_the_law_says():
     law = np.array([1.0, 0.5, 0.25, 2.0, 0.1])
     assert local_scales(law, 2.0) == pytest.approx(((1 + 1 + 1) ** 2, 2.2**2))
-    assert local_scales(np.array([0.01, 0, 0, 1.0, 0]), 0.0)[0] == pytest.approx(0.2**2), "the floor of sigma"
+    assert local_scales(np.array([0.01, 0, 0, 1.0, 0]), 0.0)[0] == pytest.approx(0.01**2)
+    assert local_scales(np.array([-0.01, 0, 0, 1.0, 0]), 0.0)[0] == pytest.approx(LEAST_SIGMA**2)
 
 
 def corner(fold, seed=0):
@@ -236,7 +243,7 @@ def test_two_flat_sides_are_no_bent_surface_even_if_it_is_within_the_noise(seed)
     assert not allowed
     moments, rule, work, own, _ = prepared(signals, labels, degrees=(4, 1))
     boxes = region_boxes(labels, 2)
-    assert compare(moments, 1, 2, rule._replace(earn=False), own, boxes, 1.0, 1.0, work)[2]
+    assert compare(moments, 1, 2, rule._replace(earn=False), own, boxes, 1.0, 1.0, 1.0, work)[2]
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rcseg_core import BezierPatch, RangeColorFrame, Region, segment
-from rcseg_core.extents import SAMPLES, region_extents
+from rcseg_core.result.extents import SAMPLES, region_extents
 from rcseg_core.synthetic import make_scene
 
 

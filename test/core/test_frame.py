@@ -32,11 +32,13 @@ COLOR = np.zeros((6, 8, 3), np.uint8)
         (POINTS[:, :1], COLOR[:, :1], None, "the image is 1x6: at least 3x3 pixels are needed"),
         (POINTS, COLOR, "camera", "camera: expected a PinholeCamera or None, got str"),
         (POINTS, COLOR, np.eye(3), "camera: expected a PinholeCamera or None, got ndarray"),
-        (POINTS * np.nan, COLOR, CAMERA, "no valid pixel: every point is NaN or has z = 0"),
-        (POINTS * 0, COLOR, CAMERA, "no valid pixel"),
-        (POINTS * 0, COLOR, None, "no valid pixel"),
-        (-POINTS, COLOR, CAMERA, "no valid pixel"),
-        (POINTS * np.inf, COLOR, CAMERA, "no valid pixel"),
+        (POINTS * np.nan, COLOR, CAMERA, "no valid pixel: every point is NaN, infinite or (0, 0, 0)"),
+        (POINTS * 0, COLOR, CAMERA, "no valid pixel: every point is NaN, infinite or (0, 0, 0)"),
+        (POINTS * 0, COLOR, None, "no valid pixel: every point is NaN, infinite or (0, 0, 0)"),
+        (-POINTS, COLOR, CAMERA, "no valid pixel: none of the 48 points lies before the camera (z > 0)"),
+        (POINTS * [1, 1, 0], COLOR, CAMERA, "no valid pixel: none of the 48 points lies before the camera"),
+        (POINTS * np.inf, COLOR, CAMERA, "no valid pixel: every point is NaN, infinite"),
+        (POINTS * np.float32(1e30), COLOR, None, "no valid pixel: all 48 points lie beyond what is metres"),
     ],
 )
 def test_what_is_refused_and_in_which_words(points, color, camera, text):
@@ -100,6 +102,16 @@ def test_with_a_camera_as_well(channel, bad):
     assert np.argwhere(~RangeColorFrame(points, COLOR, CAMERA).valid).tolist() == [[1, 2]]
 
 
+def test_points_in_the_plane_z_0_are_points_without_a_camera():
+    """The floor of a map, the horizon of a lidar; with a camera nothing can be measured there."""
+    points = POINTS.copy()
+    points[:3, :, 2] = 0
+    points[5, 5] = 0
+    assert np.argwhere(~RangeColorFrame(points, COLOR, None).valid).tolist() == [[5, 5]]
+    beside = RangeColorFrame(points, COLOR, CAMERA)
+    assert not beside.valid[:3].any() and beside.valid[3:].sum() == 23
+
+
 def test_points_behind_a_scanner_are_points():
     points = POINTS.copy()
     points[..., 2] = -1
@@ -127,3 +139,13 @@ def test_every_layout_comes_to_the_kernels_as_one():
     for array in (odd.points, odd.color):
         assert array.flags.c_contiguous and array.flags.writeable
     np.testing.assert_array_equal(odd.color, color[::2, ::-1])
+
+
+def test_a_frame_without_extent_is_refused_in_one_line():
+    from rcseg_core import SegmenterConfig, segment
+
+    points = np.zeros((3, 3, 3), np.float32)
+    points[..., 0] = np.arange(3)
+    frame = RangeColorFrame(points, np.zeros((3, 3, 3), np.uint8))
+    with pytest.raises(InputError, match="no extent"):
+        segment(frame, SegmenterConfig().replace({"noise.range_model": "kinect_v1"}))

@@ -5,10 +5,10 @@ import pytest
 from crafted import crafted_signals
 
 from rcseg_core import PinholeCamera, RangeColorFrame, SegmenterConfig, segment
-from rcseg_core.gaps import fill_holes, treat_flying
-from rcseg_core.models import fit_models
-from rcseg_core.moments import accumulate
-from rcseg_core.signals import INVALID
+from rcseg_core.models.moments import accumulate
+from rcseg_core.models.polynomials import fit_models
+from rcseg_core.pixels.gaps import fill_holes, treat_flying
+from rcseg_core.signal.signals import INVALID
 
 SHAPE = (24, 32)
 ROWS, COLS = np.mgrid[: SHAPE[0], : SHAPE[1]]

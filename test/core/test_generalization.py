@@ -1,16 +1,18 @@
 """Generalisation: the nested F test against scipy on pixels (eq. 22-23), its level, and what stops it."""
 
+import cv2
 import numpy as np
 import pytest
 from oracle import naive_patch
 from scipy.stats import f as f_distribution
 
 from rcseg_core.config import GeneralizationConfig
-from rcseg_core.generalization import choose_degrees, f_test, residuals_by_degree
-from rcseg_core.moments import UNIT_PX, accumulate, tensor_exponents
+from rcseg_core.decision.generalization import choose_degrees, f_test, residuals_by_degree
+from rcseg_core.models.moments import accumulate, tensor_exponents
+from rcseg_core.signal.units import UNIT_PX
 
 SHAPE = (40, 48)
-WHITE = (1.0, 1.0)
+WHITE, UNBENT = (1.0, 1.0), (0.0, 0.0)
 
 
 def measured(signal, degree=4, seed=0, noise=1.0):
@@ -27,10 +29,10 @@ def surface(shape_of=lambda x, y: 0.0 * x):
     return np.stack([shape_of(x, y), 2 * x + y, 0 * x], -1)
 
 
-def chosen(moments, **changes):
+def chosen(moments, correlation=WHITE, systematic2=UNBENT, **changes):
     config = GeneralizationConfig(**changes)
     start = np.ones((2, 2), np.int64)
-    degree = choose_degrees(moments, 1, start, np.ones((2, 2)), WHITE, config)
+    degree = choose_degrees(moments, 1, start, np.ones((2, 2)), correlation, systematic2, config)
     assert (start == 1).all(), "the argument was changed"
     return degree[1]
 
@@ -90,11 +92,15 @@ def test_a_plane_stays_one_and_range_and_colour_choose_apart():
 
 
 def test_the_bare_f_test_follows_effects_that_are_too_small_to_matter():
-    """At thousands of pixels a tenth of a sigma is significant; the guarded test asks for a quarter."""
+    """At thousands of pixels a seventh of a sigma is significant; a bent sensor makes as much."""
     _, moments = measured(surface(lambda x, y: 0.5 * x * x))
+    bent = (0.25**2, 0.0)
     assert chosen(moments, test="f")[0] >= 2
-    assert chosen(moments, test="guarded")[0] == 1
-    assert chosen(moments, test="guarded", min_effect=0.05)[0] == 2
+    assert chosen(moments, systematic2=bent, test="f")[0] >= 2
+    assert chosen(moments, systematic2=bent, test="guarded")[0] == 1
+    assert chosen(moments, systematic2=(0.02**2, 0.0), test="guarded")[0] == 2
+    _, strong = measured(surface(lambda x, y: 10.0 * x * x))
+    assert chosen(strong, systematic2=bent, test="guarded")[0] == 2
 
 
 def test_degrees_have_tops_and_need_pixels():
@@ -111,8 +117,35 @@ def test_degrees_have_tops_and_need_pixels():
 def test_correlated_pixels_count_for_fewer():
     """What 1920 independent pixels would prove, 1920 pixels worth 77 do not."""
     _, moments = measured(surface(lambda x, y: 0.5 * x * x))
-    start = np.ones((2, 2), np.int64)
-    config = GeneralizationConfig(test="f", alpha=1e-3)
-    white = choose_degrees(moments, 1, start, np.ones((2, 2)), WHITE, config)
-    correlated = choose_degrees(moments, 1, start, np.ones((2, 2)), (25.0, 25.0), config)
-    assert white[1, 0] > correlated[1, 0] == 1
+    for changes in ({"test": "f", "alpha": 1e-3}, {"test": "guarded"}):
+        assert chosen(moments, **changes)[0] > chosen(moments, (25.0, 25.0), **changes)[0] == 1
+
+
+def test_each_modality_has_an_error_of_its_own():
+    """The same bow in range and in colour: only where the error explains it does the degree stay."""
+    _, moments = measured(surface(lambda x, y: 2 * x * x)[..., [0, 0, 2]])
+    assert chosen(moments).tolist() == [2, 2]
+    assert chosen(moments, systematic2=(1.0, 0.0)).tolist() == [1, 2]
+    assert chosen(moments, systematic2=(0.0, 1.0)).tolist() == [2, 1]
+    assert chosen(moments, correlation=(400.0, 1.0)).tolist() == [1, 2]
+    assert chosen(moments, correlation=(1.0, 400.0)).tolist() == [2, 1]
+
+
+@pytest.mark.parametrize("blur", [1.0, 1.5])
+def test_correlated_error_alone_raises_no_degree(blur):
+    """Of 300 regions of noise that is blurred by a Gaussian: 4 pi s^2 pixels make one number."""
+    side, down, across = 48, 12, 25
+    rng = np.random.default_rng(3)
+    image = np.zeros((side * down, side * across, 1))
+    image[..., 0] = cv2.GaussianBlur(rng.normal(size=image.shape[:2]), (0, 0), blur)
+    image = (image / image.std()).astype(np.float32)
+    labels = (np.arange(down)[:, None] * across + np.arange(across) + 1).astype(np.int32)
+    labels = np.ascontiguousarray(labels.repeat(side, 0).repeat(side, 1))
+    count = down * across
+    moments = accumulate(image, np.zeros(labels.shape, np.uint8), labels, count, 4)
+    start, variance = np.ones((count + 1, 2), np.int64), np.ones((count + 1, 2))
+    m = 4 * np.pi * blur**2
+    known = choose_degrees(moments, 1, start, variance, (m, 1.0), UNBENT, GeneralizationConfig())
+    taken_for_white = choose_degrees(moments, 1, start, variance, WHITE, UNBENT, GeneralizationConfig())
+    assert (known[1:, 0] > 1).mean() <= 0.01
+    assert (taken_for_white[1:, 0] > 1).mean() > 0.2

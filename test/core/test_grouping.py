@@ -9,11 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracle import naive_graph
 
-from rcseg_core import grouping
-from rcseg_core.adjacency import find_pairs
 from rcseg_core.config import SegmenterConfig
-from rcseg_core.moments import UNIT_PX, accumulate, region_boxes
-from rcseg_core.stages import make_rule
+from rcseg_core.graph import grouping
+from rcseg_core.graph.adjacency import find_pairs
+from rcseg_core.models.moments import accumulate, region_boxes
+from rcseg_core.signal.units import UNIT_PX
+from rcseg_core.stages.measures import make_rule
 
 SHAPE = (32, 40)
 
@@ -29,7 +30,7 @@ def scene(seed, pieces=(4, 5), levels=(0.0, 0.5, 1.0, 4.0)):
     level = rng.choice(levels, size=(pieces[0] * pieces[1] + 1, 1)) * np.array([1.0, 1.0, -1.0, 0.5])
     image = level[labels] + rng.normal(size=(*SHAPE, 4))
     edges = np.where(rng.random(SHAPE) < 0.15, rng.integers(1, 8, SHAPE), 0).astype(np.uint8)
-    return crafted_signals(image, 1, eps=0.5, color_eps=1.0), labels, edges
+    return crafted_signals(image, 1, eps=0.5, color_eps=1.0, correlation=1.2, systematic=0.2), labels, edges
 
 
 def grouped(signals, labels, edges, gated=True, limit=1.0, degree=1, planes=True, **changes):
@@ -42,12 +43,16 @@ def grouped(signals, labels, edges, gated=True, limit=1.0, degree=1, planes=True
     return result, moments, pairs, rule
 
 
+def errors_of(rule):
+    return tuple(zip(rule.correlation, rule.systematic2, strict=True))
+
+
 def by_hand(signals, labels, edges, rule, gated, whole=False):
     rows, cols = np.indices(SHAPE).reshape(2, -1)
     tallies = naive_graph.pairs(labels, edges, 3)
     ratio = naive_graph.PlaneRatio(
         cols / UNIT_PX, rows / UNIT_PX, signals.image.reshape(-1, 4).astype(float), labels.ravel(), 1,
-        rule.share2, (0.25, signals.color_eps2), tallies if gated else None, whole,
+        errors_of(rule), (0.25, signals.color_eps2), tallies if gated else None, whole,
     )  # fmt: skip
     return naive_graph.group(int(labels.max()), set(tallies), ratio)
 
@@ -68,6 +73,22 @@ def test_the_merges_are_those_of_looking_at_every_pair_each_time(eager, seed, ga
     merges, _ = by_hand(signals, labels, edges, rule, gated, criterion == "chow")
     assert 3 < len(merges) < labels.max() - 1, "the scene is to leave some pairs apart"
     assert result.merges.tolist() == [list(pair) for pair in merges]
+
+
+@pytest.mark.parametrize("seed", [11, 14, 21, 4])
+def test_no_merge_exceeds_the_limit_when_it_is_made(seed):
+    """A pair that was allowed may be so no more once its larger side has grown."""
+    signals, labels, edges = scene(seed, (8, 10), levels=(0.0, 0.5, 1.0, 1.5))
+    result, _, _, rule = grouped(signals, labels, edges)
+    rows, cols = np.indices(SHAPE).reshape(2, -1)
+    ratio = naive_graph.PlaneRatio(
+        cols / UNIT_PX, rows / UNIT_PX, signals.image.reshape(-1, 4).astype(float), labels.ravel(), 1,
+        errors_of(rule), (0.25, signals.color_eps2), naive_graph.pairs(labels, edges, 3),
+    )  # fmt: skip
+    members = {k: {k} for k in range(1, int(labels.max()) + 1)}
+    for keep, gone in result.merges.tolist():
+        assert ratio(members[keep], members[gone]) <= 1.0
+        members[keep] |= members.pop(gone)
 
 
 def partition_of(count, merges):

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracle.invariants import check_tree, joins_only
 
-from rcseg_core.hierarchy import Hierarchy, TreeBuilder, join_heights
+from rcseg_core.graph.hierarchy import Hierarchy, TreeBuilder, join_heights
 
 
 def random_tree(seed, leaves=12, merges=8, late=3):

@@ -5,7 +5,7 @@ import pytest
 from oracle.invariants import check_invariants
 
 from rcseg_core import SegmenterConfig, segment
-from rcseg_core.evaluation import evaluate_labels
+from rcseg_core.evaluation.frames import evaluate_labels
 from rcseg_core.synthetic import make_scene
 
 SIZE = {"width": 200, "height": 150}

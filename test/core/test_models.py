@@ -5,9 +5,13 @@ import pytest
 from crafted import crafted_signals
 from oracle.naive_growth import predict as direct
 
-from rcseg_core.models import fit_models, pixel_cost, predict
-from rcseg_core.moments import UNIT_PX, accumulate
-from rcseg_core.signals import COLOR_OUTLIER, INVALID, RANGE_OUTLIER
+from rcseg_core.compute.parallel import LEAST_PRODUCTS
+from rcseg_core.decision.generalization import residuals_by_degree
+from rcseg_core.models.moments import Moments, accumulate
+from rcseg_core.models.polynomials import fit_models, pixel_cost, predict
+from rcseg_core.models.triangular import solve_triangular
+from rcseg_core.signal.signals import COLOR_OUTLIER, INVALID, RANGE_OUTLIER
+from rcseg_core.signal.units import UNIT_PX
 
 SHAPE = (30, 36)
 
@@ -71,3 +75,31 @@ def test_a_region_without_usable_pixels_has_a_flat_model():
     models = fit_models(moments, degree, 1)
     assert not models.coef[2].any()
     assert np.isfinite(models.coef).all()
+
+
+def test_many_regions_are_fitted_like_each_alone():
+    """They are shared out in parts, whose bounds lose no region nor take the sums of another."""
+    rng = np.random.default_rng(5)
+    labels = np.arange(1, 121, dtype=np.int32).reshape(10, 12).repeat(7, axis=0).repeat(8, axis=1)
+    image = rng.normal(size=(*labels.shape, 2)).astype(np.float32)
+    flags = np.zeros(labels.shape, np.uint8)
+    together = accumulate(image, flags, labels, 120, 4)
+    degree = rng.choice([1, 2, 4], (121, 2))
+    models, table = fit_models(together, degree, 1), residuals_by_degree(together, 1, 4)
+    assert len(together.energy) * 25**2 > 4 * LEAST_PRODUCTS, "too few to be parted"
+    for k in (1, 2, 29, 30, 31, 60, 61, 90, 91, 119, 120):
+        alone = Moments(*(np.stack([0 * a[0], a[k]]) for a in together))
+        np.testing.assert_array_equal(fit_models(alone, degree[[0, k]], 1).coef[1], models.coef[k])
+        np.testing.assert_array_equal(residuals_by_degree(alone, 1, 4)[1], table[k])
+    assert not models.coef[0].any() and not table[0].any()
+
+
+@pytest.mark.parametrize("size", [1, 3, 9])
+def test_triangles_are_solved_like_the_whole(size):
+    rng = np.random.default_rng(size)
+    root = np.tril(rng.normal(size=(12, 12))) + 4 * np.eye(12)
+    right, out = rng.normal(size=12), np.full(12, np.nan)
+    solve_triangular(root, size, right, out)
+    whole = root[:size, :size] @ root[:size, :size].T
+    np.testing.assert_allclose(out[:size], np.linalg.solve(whole, right[:size]), rtol=1e-9)
+    assert np.isnan(out[size:]).all()

@@ -6,8 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracle import naive_patch
 
-from rcseg_core.moments import (
-    UNIT_PX,
+from rcseg_core.models.moments import (
     accumulate,
     mean_square_gradient,
     plane_exponents,
@@ -17,6 +16,7 @@ from rcseg_core.moments import (
     solve,
     tensor_exponents,
 )
+from rcseg_core.signal.units import UNIT_PX
 
 DEGREES = (1, 2, 3, 4)
 

@@ -4,19 +4,22 @@ import cv2
 import numpy as np
 import pytest
 
-from rcseg_core import PinholeCamera, RangeColorFrame, SegmenterConfig
-from rcseg_core.cleaning import color_median, local_median
+from rcseg_core import PinholeCamera, RangeColorFrame, SegmenterConfig, segment
 from rcseg_core.config import NoiseConfig
-from rcseg_core.noise import (
+from rcseg_core.resampling.reduction import unreduced
+from rcseg_core.signal.cleaning import color_median, local_median
+from rcseg_core.signal.noise import (
     BLOCK_PX,
     COLOR_FLOOR_LEVELS,
     RELATIVE_FLOOR,
     SENSOR_MODELS,
     WINDOW_PX,
+    _near,
+    _quantile_of_levels,
     estimate_noise,
     window_residuals,
 )
-from rcseg_core.signals import build_signals
+from rcseg_core.signal.signals import build_signals
 
 SHAPE = (240, 320)
 CAMERA = PinholeCamera(260.0, 260.0, 159.5, 119.5)
@@ -53,8 +56,8 @@ def test_window_residuals_are_those_of_a_plane_through_the_pixels():
     valid = rng.random(rows.shape) > 0.2
     median = np.where(valid, values, 0).astype(np.float32)  # no impulse
     out = np.empty((6, 3))
-    window_residuals(values[..., None], median[..., None], valid, 0, 1.0, 20, 0, 1, out)
-    window_residuals(values[..., None], median[..., None], valid, 0, 1.0, 20, 1, 2, out)
+    window_residuals(values[..., None], median[..., None], valid, 0, np.ones(6), 20, 0, 1, out)
+    window_residuals(values[..., None], median[..., None], valid, 0, np.ones(6), 20, 1, 2, out)
     index = 0
     for row0 in (0, 20):
         for col0 in (0, 20, 40):
@@ -207,19 +210,19 @@ def test_a_frame_that_tells_its_noise_hardly_hears_the_prior():
 
 
 def test_the_prior_speaks_where_only_clutter_is():
-    """A smooth wall at 1.25 m, and all that is farther is rough: there is no window there to measure.
+    """A smooth wall at 0.8 m, and all that is farther is rough: there is no window there to measure.
 
     The noise that the wall shows is that of the law; carried on as a constant it would be wrong far away.
     """
     rng = np.random.default_rng(0)
-    w = np.full(SHAPE, 0.8)
+    w = np.full(SHAPE, 1.25)
     w[:, 200:] = rng.uniform(0.2, 0.6, (SHAPE[0], 120))
     w += kinect(w) * rng.normal(size=SHAPE)
     valid = np.ones(SHAPE, bool)
     valid[:, 200:] = rng.random((SHAPE[0], 120)) < 0.4  # too few in any window
-    far, near = np.array(0.25), np.array(0.8)
+    far, near = np.array(0.25), np.array(1.25)
     alone, both = estimated(w, valid), estimated(w, valid, range_prior="kinect_v1")
-    assert both.range_sigma(near) == pytest.approx(kinect(0.8), rel=0.15)
+    assert both.range_sigma(near) == pytest.approx(kinect(1.25), rel=0.15)
     assert both.range_sigma(far) == pytest.approx(kinect(0.25), rel=0.15)
     assert alone.range_sigma(far) != pytest.approx(kinect(0.25), rel=0.15)
 
@@ -231,7 +234,41 @@ def test_a_fixed_law_takes_no_prior():
     assert fixed.source == "kinect_v1"
 
 
-@pytest.mark.parametrize("model", ["constant", "kinect_v1", "realsense_d435", "auto"])
+def test_a_stated_law_is_used_as_it_stands():
+    stated = {"range_law_a": 0.003, "range_law_b": 0.002, "range_law_c": 0.001}
+    w = room() + white()
+    noise = estimated(w, range_model="law", **stated, range_correlation=12.5, range_systematic=0.7)
+    assert noise.range_law.tolist() == [[0.003, 0.002, 0.001]] and noise.source == "law"
+    assert (noise.range_correlation, noise.range_systematic) == (12.5, 0.7)
+    # each part may be stated alone; the others are measured
+    measured = estimated(w)
+    some = estimated(w, range_correlation=12.5)
+    assert some.range_correlation == 12.5 and some.range_systematic == measured.range_systematic
+    none = estimated(w, range_systematic=0.0)
+    assert none.range_systematic == 0.0 and none.range_correlation == measured.range_correlation
+    np.testing.assert_array_equal(none.range_law, measured.range_law)
+
+
+@pytest.mark.parametrize("stated", [0.0, 0.5])
+def test_planes_do_not_change_a_stated_systematic_part(stated):
+    """A wall that is bent by most of a sigma: what is stated stands all the same."""
+    cols = np.arange(SHAPE[1])
+    depth_m = 1 / (0.5 + 0.005 * ((cols - 160) / 160) ** 2 + white())
+    frame = RangeColorFrame.from_depth(depth_m.astype(np.float32), np.full((*SHAPE, 3), 90, np.uint8), CAMERA)
+    config = SegmenterConfig().replace({"grouping.order": "range_only"})
+    assert segment(frame, config).noise.range_systematic > 0.3
+    config = config.replace({"noise.range_systematic": stated})
+    assert segment(frame, config).noise.range_systematic == stated
+
+
+def test_a_square_of_pixels_is_worth_its_share_of_a_stated_correlation():
+    config = SegmenterConfig().replace({"signal.reduction": 2, "noise.range_correlation": 20.0})
+    assert unreduced(config).noise.range_correlation == 5.0
+    assert unreduced(config.replace({"noise.range_correlation": 2.0})).noise.range_correlation == 1.0
+    assert unreduced(config.replace({"noise.range_correlation": 0.0})).noise.range_correlation == 0.0
+
+
+@pytest.mark.parametrize("model", ["constant", "law", "kinect_v1", "realsense_d435", "auto"])
 def test_scanner_grids_have_one_sigma_a_channel(model):
     rows, cols = np.mgrid[:120, :160]
     rng = np.random.default_rng(0)
@@ -247,6 +284,7 @@ def test_scanner_grids_have_one_sigma_a_channel(model):
         "constant": [0.004] * 3,
         "kinect_v1": [0.0012 + 0.0019 * 1.1**2] * 3,
         "realsense_d435": [1.5**2 * 0.1 / 32] * 3,
+        "law": [1.5**2 * 0.002] * 3,
         "auto": [6e-4, 1e-3, 2e-3],  # x is held to 0.3 of the noisiest
     }[model]
     np.testing.assert_allclose(sigma, wanted, rtol=0.12 if model == "auto" else 5e-3)
@@ -258,3 +296,27 @@ def test_images_too_small_to_measure_fall_back_to_the_floor(shape):
     noise = estimated(w)
     assert np.isfinite(noise.range_law).all()
     assert (noise.range_sigma(w) > 0).all()
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.7, 1.0])
+@pytest.mark.parametrize("top", [1, 3, 40, 256])
+def test_quantiles_of_levels_are_those_of_the_numbers(share, top):
+    rng = np.random.default_rng(top)
+    for count in (1, 2, 7, 1000):
+        values = rng.integers(0, top, count)
+        found = _quantile_of_levels(np.bincount(values, minlength=256), share)
+        assert found == pytest.approx(np.quantile(values, share))
+    assert _quantile_of_levels(np.zeros(256, int), share) == 0.0
+
+
+def test_impulses_are_six_sigmas_from_the_median_in_the_last_channel():
+    rng = np.random.default_rng(2)
+    signal, median = rng.uniform(0.2, 2, (2, 30, 40, 2)).astype(np.float32)
+    valid = rng.random((30, 40)) < 0.8
+    law, floor = np.array([0.01, -0.05, 0.04]), 0.02
+    near = np.empty(valid.shape, bool)
+    _near(signal, median, valid, law, floor, 0, 30, near)
+    m = median[..., 1].astype(float)
+    sigma = np.maximum(law[0] + law[1] * m + law[2] * m**2, floor)
+    np.testing.assert_array_equal(near, valid & (abs(signal[..., 1] - median[..., 1]) <= 6 * sigma))
+    assert 0.1 < near.mean() < 0.7

@@ -15,7 +15,8 @@ TEXT = (HERE.parents[1] / "docs" / "notation.md").read_text()
 NAMES = sorted(set(re.findall(r"`([^`]+)`", TEXT)))
 TESTS = [name for name in NAMES if "::" in name]
 SETTINGS = [name for name in NAMES if re.fullmatch(r"[a-z_]+\.[a-z_]+ = \w+", name)]
-MODULES = {path.stem for path in (HERE.parents[1] / "rcseg_core").glob("*.py")} | {"synthetic"}
+CORE = HERE.parents[1] / "rcseg_core"
+MODULES = {path.stem for path in CORE.glob("*.py")} | {path.parent.name for path in CORE.glob("*/*.py")}
 CODE = [name for name in NAMES if re.fullmatch(r"\w+(\.\w+)+", name) and name.split(".")[0] in MODULES]
 
 

@@ -1,5 +1,7 @@
 """Label image, leaf image and merge tree stay in step whatever is done to the partition."""
 
+import tracemalloc
+
 import cv2
 import numpy as np
 import pytest
@@ -8,14 +10,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracle.invariants import check_tree
 
-from rcseg_core.adjacency import find_pairs
-from rcseg_core.grouping import Grouped, add_merged
-from rcseg_core.models import fit_models
-from rcseg_core.moments import UNIT_PX, accumulate, region_boxes
-from rcseg_core.partition import Partition
-from rcseg_core.signals import INVALID
+from rcseg_core.config import SegmenterConfig
+from rcseg_core.graph.adjacency import find_pairs
+from rcseg_core.graph.continuity import continuous_pairs
+from rcseg_core.graph.grouping import Grouped, add_merged
+from rcseg_core.models.moments import accumulate, region_boxes
+from rcseg_core.models.polynomials import fit_models
+from rcseg_core.partition.partition import Partition, majority
+from rcseg_core.signal.signals import INVALID, MISFIT
+from rcseg_core.signal.units import UNIT_PX
+from rcseg_core.stages.passes import settle
 
 SHAPE = (18, 24)
+NO_REFINEMENT = {"absorption.refine_passes": 0}
 
 
 def seeds(seed, count=8, free=0.2):
@@ -46,6 +53,76 @@ def check(partition):
     wanted = partition.nodes[partition.labels[labelled]]
     assert np.array_equal(root[partition.leaves[labelled]], wanted)
     assert len(set(partition.nodes[1:].tolist())) == partition.count
+
+
+def test_moments_hold_what_is_labelled_and_unflagged_whenever_a_flag_was_set():
+    """Pixels are flagged, moved and freed in any order: nothing is taken away that was never added."""
+    signals = crafted_signals(np.random.default_rng(0).normal(size=(*SHAPE, 1)), 1)
+    partition = Partition(seeds(4, free=0.0), 8)
+    rng = np.random.default_rng(1)
+    for _ in range(6):
+        moments = partition.moments(signals, 2)
+        wanted = accumulate(signals.image, signals.flags, partition.labels, 8, 2)
+        np.testing.assert_array_equal(np.rint(moments.count), np.rint(wanted.count))
+        np.testing.assert_allclose(moments.energy, wanted.energy, atol=1e-9)
+        signals.flags[rng.random(SHAPE) < 0.1] |= MISFIT
+        signals.flags[rng.random(SHAPE) < 0.3] &= ~np.uint8(MISFIT)
+        partition.labels[:] = rng.permutation(9).astype(np.int32)[partition.labels]
+        partition.pixels_changed()
+
+
+def test_pairs_are_those_of_the_edges_the_gap_and_the_bounds_that_are_asked_for():
+    partition = Partition(seeds(4, free=0.0), 8)
+    none, some = np.zeros(SHAPE, np.uint8), np.full(SHAPE, 1, np.uint8)
+    assert not partition.pairs(none, 3).range_crossed.any()
+    assert partition.pairs(some, 3).range_crossed.all()
+    partition.labels[:, 6] = 0
+    partition.pixels_changed()
+    assert len(partition.pairs(none, 3).boundary) > len(partition.pairs(none, 0).boundary)
+    partition.within = np.repeat([[1] * 12 + [2] * 12], SHAPE[0], axis=0).astype(np.int32)
+    halves = partition.groups()
+    assert all(halves[a] == halves[b] for a, b in partition.pairs(none, 3).nodes)
+    assert partition.pairs(none, 3) is partition.pairs(none, 3)
+
+
+@pytest.mark.parametrize("scale", [1.0, 30.0, 1000.0])
+def test_what_fits_nowhere_still_joins_the_region_that_predicts_it_best(scale):
+    """Three pixels between two regions, hundreds of sigmas from both and nearer to the second."""
+    value = np.zeros(SHAPE)
+    value[:, 11:] = 150.0 * scale
+    labels = np.where(value > 0, 2, 1).astype(np.int32)
+    value[5, 10:13], labels[5, 10:13] = 90.0 * scale, 0
+    partition = Partition(labels, 2)
+    settle(partition, crafted_signals(value[..., None], 1), SegmenterConfig().replace(NO_REFINEMENT))
+    assert partition.labels[5, 10:13].tolist() == [2, 2, 2]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_majority_is_that_of_all_pixels(seed):
+    rng = np.random.default_rng(seed)
+    a, b = Partition(seeds(seed), 8), Partition(rng.integers(0, 4, SHAPE).astype(np.int32), 3)
+    a.labels[a.labels == 3] = 0  # one without any pixel
+    table = np.zeros((9, 4), int)
+    np.add.at(table, (a.labels, b.labels), 1)
+    assert np.array_equal(majority(a, b), table.argmax(axis=1))
+
+
+def test_thousands_of_regions_need_no_table_of_all_pairs():
+    labels = np.arange(1, 6001, dtype=np.int32).reshape(60, 100).repeat(2, 0).repeat(2, 1)
+    partition, surfaces = Partition(labels, 6000), Partition(labels.copy(), 6000)
+    signals = crafted_signals(np.random.default_rng(0).normal(size=(*labels.shape, 1)), 1)
+    moments = partition.moments(signals, 1)
+    models = fit_models(moments, np.ones((6001, 2), np.int64), 1)
+    pairs = partition.pairs(np.zeros(labels.shape, np.uint8), 3)
+    tracemalloc.start()
+    try:
+        assert np.array_equal(majority(partition, surfaces), np.arange(6001))
+        curved, sizes = np.ones(6001, bool), partition.sizes()
+        sizes[1::2] *= 9
+        continuous_pairs(labels, signals, models, pairs, curved, sizes, 9.0)
+        assert tracemalloc.get_traced_memory()[1] < 20e6
+    finally:
+        tracemalloc.stop()
 
 
 def test_a_fresh_partition_is_its_own_tree():

@@ -1,11 +1,26 @@
 """segment() on scenes with truth and on input that is hard: what it promises holds for every frame."""
 
+import time
+
 import numpy as np
 import pytest
 from oracle.invariants import check_invariants
 
-from rcseg_core import ConfigError, InputError, PinholeCamera, RangeColorFrame, SegmenterConfig, segment
-from rcseg_core.evaluation import evaluate_labels
+from rcseg_core import (
+    ConfigError,
+    InputError,
+    PinholeCamera,
+    RangeColorFrame,
+    SegmenterConfig,
+    pipeline,
+    segment,
+)
+from rcseg_core.evaluation.frames import evaluate_labels
+from rcseg_core.partition.parting import split_creases
+from rcseg_core.partition.partition import Partition
+from rcseg_core.signal.edges import ORIENTATION
+from rcseg_core.signal.signals import MISFIT, build_signals
+from rcseg_core.stages import linking, passes
 from rcseg_core.synthetic import FAMILIES, make_scene
 
 SMALL = {"width": 160, "height": 120}
@@ -143,7 +158,7 @@ def test_invalid_pixels_and_impulses_leave_the_regions_whole():
 
 CHANGES = {
     "signal.kind": ("xyz", "inverse_depth"),
-    "noise.range_model": ("constant", "kinect_v1", "realsense_d435"),
+    "noise.range_model": ("constant", "law", "kinect_v1", "realsense_d435"),
     "noise.range_prior": ("kinect_v1", "realsense_d435"),
     "reflectance.mode": ("active",),
     "seeds.fit": ("lms",),
@@ -185,7 +200,7 @@ def test_every_choice_of_the_configuration_is_tried():
                 assert (parameter.key, option) in {
                     ("reflectance.mode", "calibrated"),
                     ("absorption.enabled", False),
-                }
+                } or parameter.key == "world.up_from"  # labels do not depend on it: test_world_up
 
 
 @pytest.mark.parametrize(
@@ -202,7 +217,7 @@ def test_every_choice_of_the_configuration_is_tried():
         {"absorption.speck": 1}, {"generalization.max_range_degree": 1},
         {"generalization.max_color_degree": 4},
         {"generalization.max_range_degree": 3, "generalization.max_color_degree": 1},
-        {"generalization.alpha": 1e-6}, {"generalization.min_effect": 0.0}, {"noise.color_sigma": 64.0},
+        {"generalization.test": "f", "generalization.alpha": 1e-6}, {"noise.color_sigma": 64.0},
         {"noise.range_model": "constant", "noise.range_sigma": 1.0},
         {"noise.range_model": "constant", "noise.range_sigma": 1e-7},
     ],
@@ -226,6 +241,46 @@ def test_a_calibrated_frame_needs_its_white_board(scenes):
         segment(scenes["room"].frame, config)
     white = frame(np.full((120, 160), 1.5), np.full((120, 160, 3), 200, np.uint8))
     check_invariants(segment(scenes["room"].frame, config, white_reference=white), scenes["room"].frame)
+
+
+@pytest.mark.parametrize("order", ["surfaces_first", "range_only", "joint"])
+def test_a_pixel_that_fitted_nowhere_counts_for_no_final_model(monkeypatch, order):
+    """Whichever pass found it out: what a pass marks is marked in the result."""
+    seen, settle = [], passes.settle
+
+    def spied(partition, signals, config):
+        models = settle(partition, signals, config)
+        seen.append(signals.flags.copy())
+        return models
+
+    monkeypatch.setattr(pipeline, "settle", spied)
+    monkeypatch.setattr(linking, "settle", spied)
+    scene = make_scene("room", 3, structured_light=True, width=320, height=240)
+    result = segment(scene.frame, DEFAULT.replace({"grouping.order": order}))
+    marked = np.bitwise_or.reduce(seen) & MISFIT != 0
+    left = marked & (result.signals.flags & MISFIT != 0)
+    assert marked.sum() > 50
+    assert left.sum() >= 0.99 * marked.sum()
+    # no region is left without a pixel that counts
+    counting = np.bincount(result.labels[result.signals.flags == 0], minlength=result.labels.max() + 1)
+    assert (counting[1:] > 0).all()
+
+
+@pytest.mark.parametrize("order", ["surfaces_first", "range_only"])
+def test_creases_that_were_found_are_edges_of_the_result(monkeypatch, order):
+    seen = []
+
+    def spied(*arguments):
+        divided, creases = split_creases(*arguments)
+        seen.append(creases)
+        return divided, creases
+
+    monkeypatch.setattr(passes, "split_creases", spied)
+    scene = make_scene("blocks", 3, structured_light=True, width=320, height=240)
+    result = segment(scene.frame, DEFAULT.replace({"grouping.order": order}))
+    creases = np.bitwise_or.reduce(seen)
+    assert (creases & ORIENTATION != 0).sum() > 50
+    assert np.array_equal(result.edges & creases, creases)
 
 
 def test_range_only_ignores_colour(scenes):
@@ -286,6 +341,52 @@ def test_float64_and_float32_points_give_the_same_labels(scenes, results):
 def test_a_configuration_is_one(scenes, config):
     with pytest.raises(ConfigError, match="config: expected a SegmenterConfig"):
         segment(scenes["room"].frame, config)
+
+
+@pytest.mark.parametrize(("width", "height"), [(80, 60), (160, 120), (640, 480)])
+def test_a_face_has_enough_pixels_for_its_shape_in_any_image(monkeypatch, width, height):
+    """Areas scale with the image; the six coefficients of a quadric do not."""
+    seen = []
+    monkeypatch.setattr(
+        passes, "split_creases", lambda partition, signals, least: seen.append(least) or (0, None)
+    )
+    frame = make_scene("blocks", 5, width=width, height=height).frame
+    signals = build_signals(frame, frame.color, DEFAULT).range_only()
+    partition = Partition(np.ones((height, width), np.int32), 1)
+    config = DEFAULT.replace({"absorption.enabled": False})
+    passes.divide_creases(partition, signals, np.zeros((height, width), np.uint8), config)
+    assert seen[0] >= 12
+
+
+@pytest.mark.parametrize("top", [1, 2, 3, 4])
+@pytest.mark.parametrize("hypothesis", ["pair", "region"])
+def test_the_highest_degree_is_one_that_grouping_tries(scenes, top, hypothesis):
+    config = DEFAULT.replace(
+        {"generalization.max_range_degree": top, "generalization.hypothesis": hypothesis}
+    )  # fmt: skip
+    frame = scenes["room"].frame
+    signals = build_signals(frame, frame.color, config).range_only()
+    tried = passes.degrees(config, signals)
+    assert tried[0] == 1 and tried[-1] == top
+
+
+@pytest.mark.parametrize("order", ["surfaces_first", "range_only", "joint"])
+def test_each_stage_has_a_time_of_its_own(scenes, monkeypatch, order):
+    """What links the signals and settles pixels is no part of the final models."""
+    names = ("link_signals", "settle_flying", "fill_small_holes")
+    during = []
+    for name in names:
+        inner = getattr(pipeline, name)
+
+        def slow(*arguments, inner=inner):
+            time.sleep(0.1)
+            during.append(inner)
+            return inner(*arguments)
+
+        monkeypatch.setattr(pipeline, name, slow)
+    result = segment(scenes["room"].frame, DEFAULT.replace({"grouping.order": order}))
+    assert result.timings["link"] >= 0.1 * len(during)
+    assert len(during) == 2
 
 
 def test_no_configuration_is_the_default_one(scenes, results):

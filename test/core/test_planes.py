@@ -6,8 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracle import naive_patch
 
-from rcseg_core.moments import UNIT_PX, accumulate
-from rcseg_core.planes import add_planes, center_planes, joint_shape, joint_signal, rise, slopes
+from rcseg_core.models.moments import accumulate
+from rcseg_core.models.planes import add_planes, center_planes, joint_shape, joint_signal, rise, slopes
+from rcseg_core.signal.units import UNIT_PX
 
 PLANE = [(0, 0), (1, 0), (0, 1)]
 

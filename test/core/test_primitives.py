@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from rcseg_core import PinholeCamera, RangeColorFrame, segment
-from rcseg_core.cells import gather_cells
-from rcseg_core.primitives import NONE
-from rcseg_core.shapes import fit_shape, start_cylinder, start_sphere
+from rcseg_core.shapes.cells import gather_cells
+from rcseg_core.shapes.fitting import fit_shape, start_cylinder, start_sphere
+from rcseg_core.shapes.primitives import NONE
 from rcseg_core.synthetic import make_scene
 
 KINECT_SIGMA_INVERSE_M = 1.425e-3

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from rcseg_core import PinholeCamera, RangeColorFrame, SegmenterConfig, segment
-from rcseg_core.agreement import covering, rand_indices
-from rcseg_core.hoover import contingency
+from rcseg_core.evaluation.agreement import covering, rand_indices
+from rcseg_core.evaluation.hoover import contingency
 from rcseg_core.synthetic import make_scene
 
 SIZE = {"width": 160, "height": 120}

@@ -5,7 +5,7 @@ import pytest
 from scans import cast, frame_of, room_scan, spherical_rays, tilt
 
 from rcseg_core import PinholeCamera, RangeColorFrame
-from rcseg_core.rays import SphericalRays, find_rays
+from rcseg_core.resampling.rays import SphericalRays, TurnedPinhole, find_rays
 from rcseg_core.synthetic import make_scene
 
 OPTICAL = np.eye(3)
@@ -143,3 +143,32 @@ def bad_grids():
 @pytest.mark.parametrize("points", [p for _, p in bad_grids()], ids=[name for name, _ in bad_grids()])
 def test_bad_grids_have_no_rays(points):
     assert find_rays(grey(points)) is None
+
+
+@pytest.mark.parametrize(
+    "axes", [LIDAR, tilt(10, -25, 40), np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])],
+    ids=["x ahead", "tilted", "on its side"],
+)  # fmt: skip
+@pytest.mark.parametrize("family", ["room", "blocks"])
+def test_a_depth_camera_in_other_axes_is_found(axes, family):
+    scene = make_scene(family, 41, width=160, height=120, noise=2.0, dropout=0.2, outliers=0.1)
+    found = find_rays(grey(scene.frame.points @ axes.T))
+    assert isinstance(found, TurnedPinhole)
+    np.testing.assert_allclose(found.axes, axes.T, atol=1e-5)
+    np.testing.assert_allclose(found.camera.matrix(), scene.frame.camera.matrix(), atol=1e-2)
+
+
+@pytest.mark.parametrize("shift", [(0.3, -0.2, 0.1), (0.0, 0.0, 1.2)])
+def test_a_depth_camera_that_was_moved_from_the_origin_is_not(shift):
+    scene = make_scene("blocks", 41, width=160, height=120)
+    assert find_rays(grey(scene.frame.points @ LIDAR.T + np.array(shift))) is None
+
+
+def test_a_whole_sweep_of_a_street_is_no_camera(shared_data):
+    path = shared_data.parent / "field" / "ouster_os2_1024x128.npz"
+    if not path.exists():
+        pytest.skip(f"no {path.name}")
+    with np.load(path) as arrays:
+        frame = RangeColorFrame(arrays["points"], arrays["color"])
+    assert frame.valid.mean() > 0.9
+    assert not isinstance(find_rays(frame), PinholeCamera | TurnedPinhole)

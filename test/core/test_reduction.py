@@ -1,10 +1,14 @@
 """Coarse to fine: squares average one side of a depth edge; the result holds at full size throughout."""
 
+import cv2
 import numpy as np
 import pytest
 
-from rcseg_core import PinholeCamera, RangeColorFrame, SegmenterConfig, parallel, segment
-from rcseg_core.reduction import reduced
+from rcseg_core import PinholeCamera, RangeColorFrame, SegmenterConfig, segment
+from rcseg_core.compute import parallel
+from rcseg_core.resampling import reduction
+from rcseg_core.resampling.reduction import reduced
+from rcseg_core.signal.signals import local_scales, measured_again
 from rcseg_core.synthetic import make_scene
 
 CAMERA = PinholeCamera(250.0, 240.0, 79.5, 59.5)
@@ -31,6 +35,17 @@ def test_the_mean_of_a_plane_is_the_plane_at_the_middle_of_the_square(step):
     np.testing.assert_allclose(whole[..., 1] / whole[..., 2], (i * step + middle - 59.5) / 240.0, atol=1e-6)
 
 
+def test_a_camera_that_changes_all_the_time_leaves_nothing_behind():
+    """A live calibration may jitter in its last digit."""
+    depth_m = np.full((40, 40), 1.0)
+    for i in range(20):
+        frame = frame_of(depth_m, camera=PinholeCamera(250.0 + 1e-9 * i, 240.0, 19.5, 19.5))
+        reduced(frame, frame.color, 2)
+        reduction.unreduced(SegmenterConfig().replace({"grouping.noise_share": 0.5 + 1e-9 * i}))
+    assert reduction._rays.cache_info().currsize <= 4
+    assert reduction.unreduced.cache_info().currsize <= 16
+
+
 def test_a_square_takes_the_side_that_more_of_it_lies_on_and_its_colour():
     depth_m, color = np.full((40, 40), 1.0), np.full((40, 40, 3), 50, np.uint8)
     depth_m[:, 11:], color[:, 11:] = 2.0, 200  # of columns 9 to 11 two are near
@@ -55,6 +70,43 @@ def test_points_without_a_camera_are_averaged_as_they_are():
     )
     wanted = points.reshape(8, 4, 9, 4, 3).mean(axis=(1, 3))
     np.testing.assert_allclose(small.points, wanted, rtol=1e-5, atol=1e-5)
+
+
+def board(sigma, levels, blur, seed=0):
+    """A tilted board with inverse depth noise, blurred over some pixels, and white colour noise."""
+    rng = np.random.default_rng(seed)
+    noise = (
+        cv2.GaussianBlur(rng.normal(size=(240, 320)), (0, 0), blur) if blur else rng.normal(size=(240, 320))
+    )
+    cols = np.arange(320)
+    color = np.clip(np.rint(rng.normal(120, levels, (240, 320, 3))), 0, 255).astype(np.uint8)
+    return frame_of(1 / (0.5 + 5e-4 * cols + sigma * noise / noise.std()), color)
+
+
+@pytest.mark.parametrize(("step", "blur"), [(2, 0.0), (2, 0.8), (2, 1.2), (3, 0.0)])
+@pytest.mark.parametrize("stated", [False, True])
+def test_a_pixel_has_its_own_noise_of_range_and_of_colour(monkeypatch, step, blur, stated):
+    """Range noise hangs together over pixels and hardly averages away; that of the colour does."""
+    seen = []
+
+    def spied(*arguments):
+        seen.append(measured_again(*arguments))
+        return seen[-1]
+
+    monkeypatch.setattr(reduction, "measured_again", spied)
+    sigma_m, levels = 0.02, 8.0
+    frame = board(4e-3, levels, blur)
+    changes = {"signal.reduction": step}
+    if stated:
+        changes |= {
+            "noise.range_model": "constant", "noise.range_sigma": sigma_m, "noise.color_sigma": levels
+        }  # fmt: skip
+    segment(frame, SegmenterConfig().replace(changes))
+    signals = seen[0]
+    assert signals.scale[1:] == pytest.approx(levels, rel=0.01 if stated else 0.15)
+    w = signals.offset[0]
+    assert signals.scale[0] == pytest.approx(sigma_m * w * w if stated else 4e-3, rel=0.01 if stated else 0.2)
+    assert local_scales(signals.law, 0.0)[0] == pytest.approx(1.0)
 
 
 @pytest.fixture(scope="module", params=[2, 3])

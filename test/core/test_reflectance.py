@@ -5,7 +5,7 @@ import pytest
 
 from rcseg_core import InputError, PinholeCamera, RangeColorFrame, SegmenterConfig, segment
 from rcseg_core.config import ReflectanceConfig
-from rcseg_core.reflectance import incidence, normalize_reflectance, pixel_normals, weigh_intensity
+from rcseg_core.signal.reflectance import incidence, normalize_reflectance, pixel_normals, weigh_intensity
 
 SHAPE = (96, 128)
 CAMERA = PinholeCamera(110.0, 110.0, 63.5, 47.5)

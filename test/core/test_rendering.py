@@ -8,9 +8,9 @@ from crafted import crafted_signals
 from oracle.naive_growth import predict as direct
 
 from rcseg_core import PinholeCamera
-from rcseg_core.models import Models
-from rcseg_core.moments import UNIT_PX
-from rcseg_core.rendering import render
+from rcseg_core.models.polynomials import Models
+from rcseg_core.result.rendering import render
+from rcseg_core.signal.units import UNIT_PX
 
 SHAPE = (20, 26)
 CAMERA = PinholeCamera(40.0, 42.0, 12.3, 9.1)

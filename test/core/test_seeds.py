@@ -1,5 +1,7 @@
 """Initial partition: least median of squares against every minimal subset, where windows lie (section 5)."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from crafted import crafted_signals
@@ -7,7 +9,7 @@ from oracle import naive_lms
 from scipy.stats import chi2
 
 from rcseg_core.config import SeedsConfig
-from rcseg_core.seeds import fit_plane, initial_partition, joint_residuals, lms_inliers
+from rcseg_core.partition.seeds import first_state, fit_plane, initial_partition, joint_residuals, lms_inliers
 
 CHANNELS = 4
 HALF, CUT = chi2.ppf(0.5, CHANNELS), chi2.ppf(0.975, CHANNELS)
@@ -33,7 +35,7 @@ def run_lms(samples, subsets=72, state=12345):
     coef, trial = np.zeros((2, CHANNELS, 3))
     use = np.zeros(n, bool)
     inliers = lms_inliers(
-        samples, n, 1, 1.0, 1.0, HALF, CUT, subsets, np.uint64(state), coef, trial, np.empty(n), use
+        samples.T.copy(), n, 1, 1.0, 1.0, HALF, CUT, subsets, np.uint64(state), coef, trial, np.empty(n), use
     )
     assert inliers == use.sum()
     return use, coef
@@ -42,7 +44,7 @@ def run_lms(samples, subsets=72, state=12345):
 def test_fit_plane_is_least_squares_on_the_used_samples():
     samples, bad, _ = window(1)
     coef = np.empty((CHANNELS, 3))
-    assert fit_plane(samples, ~bad, len(samples), coef)
+    assert fit_plane(samples.T.copy(), ~bad, len(samples), coef)
     table = np.column_stack([np.ones(len(samples)), samples[:, :2]])[~bad]
     wanted = np.linalg.lstsq(table, samples[~bad, 2:], rcond=None)[0]
     np.testing.assert_allclose(coef, wanted.T, rtol=1e-9, atol=1e-9)
@@ -51,16 +53,16 @@ def test_fit_plane_is_least_squares_on_the_used_samples():
 def test_fit_plane_refuses_a_line():
     samples, _, _ = window(1)
     use = samples[:, 1] == 0
-    assert not fit_plane(samples, use, len(samples), np.empty((CHANNELS, 3)))
+    assert not fit_plane(samples.T.copy(), use, len(samples), np.empty((CHANNELS, 3)))
     use[:] = False
     use[:2] = True
-    assert not fit_plane(samples, use, len(samples), np.empty((CHANNELS, 3)))
+    assert not fit_plane(samples.T.copy(), use, len(samples), np.empty((CHANNELS, 3)))
 
 
 def test_joint_residuals_weigh_range_and_colour_apart():
     samples, _, coef = window(2)
     out = np.empty(len(samples))
-    joint_residuals(samples, len(samples), coef.T.copy(), 1, 0.5, 2.0, out)
+    joint_residuals(samples.T.copy(), len(samples), coef.T.copy(), 1, 0.5, 2.0, out)
     rest = samples[:, 2:] - np.column_stack([np.ones(len(samples)), samples[:, :2]]) @ coef
     np.testing.assert_allclose(out, 0.5 * rest[:, 0] ** 2 + 2.0 * (rest[:, 1:] ** 2).sum(axis=1))
 
@@ -90,13 +92,33 @@ def test_72_subsets_come_near_to_all_subsets(seed):
     assert np.sort(residuals)[len(samples) // 2] == pytest.approx(median, rel=1e-6)
 
 
+@pytest.mark.parametrize("share", [1, 2, 3])
+def test_three_pixels_on_a_line_use_up_no_subset(share):
+    """One subset is enough for an exact plane, though few draws of pixels on two lines span one."""
+    samples, _, _ = window(1, size=7, outliers=0.0, noise=0.0)
+    x, y = samples[:, 0], samples[:, 1]
+    cross = samples[(y == 0) | ((x == 0) & (np.abs(y) <= share))]
+    for state in range(1, 100):
+        use, _ = run_lms(cross, subsets=1, state=state * 0x9E3779B97F4A7C15 % 2**64)
+        assert use.all()
+
+
+def test_neighbouring_windows_draw_independently():
+    states = [first_state(row, col, 11) for row in (40, 41) for col in range(400)]
+    assert len(set(states)) == len(states) and 0 not in states
+    different = [bin(int(a) ^ int(b)).count("1") for a, b in pairwise(states)]
+    assert min(different) > 10 and np.mean(different) == pytest.approx(32, abs=4)
+    pixels = np.bincount(np.array(states, np.uint64) % np.uint64(49), minlength=49)
+    assert chi2.sf(((pixels - 800 / 49) ** 2 / (800 / 49)).sum(), 48) > 1e-3
+
+
 def test_plain_least_squares_would_have_failed_there():
     """What the robust fit is for: the same windows by least squares keep outliers or lose the plane."""
     spoiled = 0
     for seed in range(25):
         samples, bad, _ = window(seed, size=9)
         coef = np.empty((CHANNELS, 3))
-        fit_plane(samples, np.ones(len(samples), bool), len(samples), coef)
+        fit_plane(samples.T.copy(), np.ones(len(samples), bool), len(samples), coef)
         table = np.column_stack([np.ones(len(samples)), samples[:, :2]])
         residuals = ((samples[:, 2:] - table @ coef.T) ** 2).sum(axis=1)
         spoiled += bool((residuals[~bad] > CUT).mean() > 0.3)

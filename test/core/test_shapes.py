@@ -1,13 +1,15 @@
 """Fits of planes, spheres and cylinders to measurements with noise along the rays."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from oracle.naive_primitives import along, distance, numeric_table
 from scipy.stats import ncx2
 
-from rcseg_core.cells import Cells
-from rcseg_core.primitives import assess, noncentral_p, recognise, turn
-from rcseg_core.shapes import (
+from rcseg_core.shapes import primitives
+from rcseg_core.shapes.cells import Cells
+from rcseg_core.shapes.fitting import (
     CYLINDER,
     FREEDOM,
     PLANE,
@@ -20,6 +22,7 @@ from rcseg_core.shapes import (
     start_plane,
     start_sphere,
 )
+from rcseg_core.shapes.primitives import assess, fit, noncentral_p, recognise, turn
 
 
 def unit(*values):
@@ -37,7 +40,7 @@ SHAPES = {
 
 def cells_of(points, normals, spread, scatter=1.0):
     m = len(points)
-    return Cells(points, normals, spread, np.full(m, 9.0), np.full(m, 9.0), np.zeros(m), scatter)
+    return Cells(points, normals, spread, np.full(m, 9.0), np.full(m, 9.0), np.zeros(m), 0.0, scatter)
 
 
 def seen_cells(kind, rng, count=200, sigma=2e-3, noise=True):
@@ -180,3 +183,18 @@ def test_the_turn_of_normals_is_the_angle_of_their_cone():
     arc = np.stack([np.sin(angle), np.zeros_like(angle), np.cos(angle)], axis=1)
     assert turn(arc) == pytest.approx(0.9, abs=2e-3)
     assert turn(np.concatenate([arc, -arc])) == pytest.approx(np.pi)
+
+
+def test_a_curved_shape_that_is_farther_off_than_the_plane_is_none(monkeypatch):
+    """Its test clips outliers, and may pass where hardly a cell is near to the shape."""
+    cells = seen_cells("sphere", np.random.default_rng(8))
+    sphere, (plane, *_) = recognise(cells)
+    assert sphere.kind == "sphere" and sphere.misfit_m < plane.misfit_m
+    far = {"sphere": plane.misfit_m * 1.1, "cylinder": plane.misfit_m * 1.2}
+
+    def farther(start, cells):
+        found = fit(start, cells)
+        return found and dataclasses.replace(found, misfit_m=far.get(found.kind, found.misfit_m))
+
+    monkeypatch.setattr(primitives, "fit", farther)
+    assert recognise(cells)[0].kind == "none"

@@ -4,8 +4,15 @@ import numpy as np
 import pytest
 
 from rcseg_core import ConfigError, PinholeCamera, RangeColorFrame, SegmenterConfig
-from rcseg_core.moments import UNIT_PX
-from rcseg_core.signals import COLOR_OUTLIER, INVALID, RANGE_OUTLIER, build_signals, local_scales
+from rcseg_core.signal.signals import (
+    COLOR_OUTLIER,
+    INVALID,
+    RANGE_OUTLIER,
+    build_signals,
+    local_scales,
+    scales,
+)
+from rcseg_core.signal.units import UNIT_PX
 
 SHAPE = (60, 80)
 CAMERA = PinholeCamera(70.0, 70.0, 39.5, 29.5)
@@ -75,6 +82,38 @@ def test_law_and_tolerances_are_in_sigmas_of_the_local_depth():
         signals.slope[0] + signals.slope[1] * (0.5 - signals.offset[0]) / signals.scale[0]
     ) * signals.scale[0]
     assert slope == pytest.approx(0.5 * UNIT_PX / 70.0)
+
+
+@pytest.mark.parametrize("model", ["auto", "constant"])
+@pytest.mark.parametrize("far_m", [2.0, 3.0, 4.0, 8.0])
+def test_constant_depth_noise_holds_far_behind_a_near_board(model, far_m):
+    """Most of the frame shows a board at 0.8 m: the wall has the noise of its own depth all the same."""
+    sigma_m = 0.004
+    depth = np.full((240, 320), far_m)
+    depth[:, :200] = 0.8
+    depth += np.random.default_rng(1).normal(0.0, sigma_m, depth.shape)
+    color = np.random.default_rng(2).normal(120, 3, (240, 320, 3)).astype(np.uint8)
+    made = RangeColorFrame.from_depth(depth, color, PinholeCamera(280.0, 280.0, 159.5, 119.5))
+    signals = built(made, **{"noise.range_model": model, "noise.range_sigma": sigma_m})
+    for z in (0.8, far_m):
+        value = (1 / z - signals.offset[0]) / signals.scale[0]
+        assumed = np.sqrt(local_scales(signals.law, value)[0]) * signals.scale[0]
+        assert assumed == pytest.approx(sigma_m / z**2, rel=0.2)
+        variance, _ = scales(signals.law, np.array([value]))
+        assert variance[0] == local_scales(signals.law, value)[0]
+    # what was measured of the wall, in the sigmas that it is judged by
+    wall = signals.image[20:-20, 220:-20, 0].astype(float)
+    variance = local_scales(signals.law, wall.mean())[0]
+    assert wall.var() / variance == pytest.approx(1.0, rel=0.4)
+
+
+@pytest.mark.parametrize("model", ["constant", "kinect_v1", "realsense_d435"])
+def test_no_law_gives_a_variance_of_zero_or_less_anywhere(model):
+    made, _, _ = frame()
+    signals = built(made, **{"noise.range_model": model, "noise.range_sigma": 0.005})
+    values = (np.linspace(-5.0, 5.0, 1001) - signals.offset[0]) / signals.scale[0]
+    variance, tolerance2 = scales(signals.law, values)
+    assert (variance > 0).all() and (tolerance2 >= 0).all()
 
 
 def test_impulses_are_flagged_in_their_own_signal_and_replaced_for_the_filters_only():

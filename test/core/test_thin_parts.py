@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rcseg_core import PinholeCamera, RangeColorFrame, SegmenterConfig, segment
-from rcseg_core.signals import RANGE_OUTLIER, build_signals
+from rcseg_core.signal.signals import RANGE_OUTLIER, build_signals
 from rcseg_core.synthetic.sensor import flying_pixels, white_noise
 
 SHAPE = (160, 200)

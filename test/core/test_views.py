@@ -5,9 +5,9 @@ import pytest
 from scans import BALL_SURFACE, cast, frame_of, room_scan, spherical_rays
 
 from rcseg_core import PinholeCamera, RangeColorFrame, SegmenterConfig
-from rcseg_core.sampling import _slope, find_back, sample_inverse_depth
+from rcseg_core.resampling.sampling import _slope, find_back, sample_inverse_depth
+from rcseg_core.resampling.views import PinholeView, _back_to_all, pinhole_view
 from rcseg_core.synthetic import make_scene
-from rcseg_core.views import PinholeView, _back_to_all, pinhole_view
 
 CONFIG = SegmenterConfig()
 

@@ -7,10 +7,10 @@ from scans import BALL, BALL_SURFACE, HALL, PLANES, SMALL_BOXES, frame_of, room_
 from rcseg_core import RangeColorFrame, SegmenterConfig, segment
 from rcseg_core.datasets import load_frame
 from rcseg_core.errors import ConfigError
-from rcseg_core.evaluation import evaluate_labels
-from rcseg_core.reflectance import normalize_reflectance
+from rcseg_core.evaluation.frames import evaluate_labels
+from rcseg_core.resampling.views import pinhole_view
+from rcseg_core.signal.reflectance import normalize_reflectance
 from rcseg_core.synthetic import make_scene
-from rcseg_core.views import pinhole_view
 
 XYZ = SegmenterConfig().replace({"signal.kind": "xyz"})
 LIDAR = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # x ahead, y left, z up
@@ -280,3 +280,30 @@ def test_the_ball_is_one_surface(scan, result):
     regions = [r for r in result.regions if r.surface == label]
     distance = np.linalg.norm(np.asarray(BALL[0]))
     assert np.linalg.norm(regions[0].centroid) == pytest.approx(distance - 0.6 * BALL[1], abs=0.1)
+
+
+@pytest.mark.parametrize("axes", [LIDAR, tilt(15, 20, -30)], ids=["x ahead", "tilted"])
+def test_a_depth_camera_in_other_axes_gives_what_it_gives_in_its_own(axes):
+    scene = make_scene("blocks", 41, width=160, height=120).frame
+    own = segment(RangeColorFrame(scene.points, scene.color))
+    turned = segment(RangeColorFrame((scene.points @ axes.T).astype(np.float32), scene.color))
+    assert evaluate_labels(own.surface_labels, turned.surface_labels).covering > 0.95
+    for region, other in zip(own.regions[:2], turned.regions[:2], strict=True):
+        np.testing.assert_allclose(other.centroid, axes @ region.centroid, atol=0.02)
+        np.testing.assert_allclose(other.normal, axes @ region.normal, atol=0.02)
+
+
+def test_a_floor_at_z_0_of_a_map_is_a_surface():
+    """It vanished: z = 0 was taken for missing."""
+    rays = spherical_rays(np.linspace(5, -45, 100), np.linspace(-35, 35, 140), LIDAR)
+    origin = np.array([2.0, 3.0, 1.2])
+    down = np.where(rays[..., 2] < 0, -1.2 / np.where(rays[..., 2] < 0, rays[..., 2], -1), np.inf)
+    ahead = 3.0 / rays[..., 0]
+    points = origin + rays * np.minimum(down, ahead)[..., None]
+    floor = down < ahead
+    points[floor, 2] = 0.0
+    frame = RangeColorFrame(points, np.full(points.shape, 128, np.uint8))
+    assert frame.valid.all() and 0.3 < floor.mean() < 0.9
+    labels = segment(frame).surface_labels
+    for number in (False, True):
+        assert best_overlap(floor, labels, number)[0] > 0.93

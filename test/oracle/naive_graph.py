@@ -49,11 +49,23 @@ def pairs(labels, edges, max_gap):
     return found
 
 
-def plane_ratio(x, y, values, one, other, n_range, allowances, budgets, whole=False):
-    """Largest of (rise of the residual) / (allowance + n budget) over sides and modalities, from pixels.
+def error_gain(correlation, systematic2, n, q):
+    """What q coefficients gain on n pixels of error alone: the mean and four deviations, in sigma^2.
 
-    one, other : (n,) bool masks; allowances : what noise costs; budgets : allowed square error of a pixel;
-    both by modality. whole : both sides together, as Chow's test does.
+    The misses along q orthonormal directions are normal, each with the variance of a correlated error, one
+    number in `correlation` pixels, and with its share of the square sum of a systematic error that lies in
+    these directions altogether.
+    """
+    each = correlation + n * systematic2 / q
+    mean, variance = q * each, 2 * q * each**2
+    return mean + 4 * variance**0.5
+
+
+def plane_ratio(x, y, values, one, other, n_range, errors, tolerances2, whole=False):
+    """Largest of (rise of the residual) / (gain of the error + n tolerance^2) over sides and modalities.
+
+    one, other : (n,) bool masks of pixels; errors : (correlation, systematic2), tolerances2 : squared
+    tolerance of a pixel, both by modality. whole : both sides together, as Chow's test does.
     """
     exponents = [(0, 0), (1, 0), (0, 1)]
     joint = one | other
@@ -66,7 +78,8 @@ def plane_ratio(x, y, values, one, other, n_range, allowances, budgets, whole=Fa
         if whole:
             rises, sizes = [sum(rises)], [sum(sizes)]
         for height, n in zip(rises, sizes, strict=True):
-            worst = max(worst, height / (allowances[modality] + n * budgets[modality]))
+            error = error_gain(*errors[modality], n, 3 * values[:, channels].shape[1])
+            worst = max(worst, height / (error + n * tolerances2[modality]))
     return worst
 
 
@@ -99,13 +112,13 @@ def group(count, adjacent, ratio):
 class PlaneRatio:
     """`ratio` for `group`: planes fitted to the pixels of two sets of seeds, tolerances gated by edges.
 
-    label (n,) seed of each pixel; share2, eps2 : allowed square errors of a pixel by noise and by modality;
-    tallies : {(a, b): [boundary, range edges, colour edges]} of seeds, or None for no gate.
+    label (n,) seed of each pixel; errors : (correlation, systematic2), eps2 : squared tolerance of a pixel,
+    both by modality; tallies : {(a, b): [boundary, range edges, colour edges]} of seeds, or None for no gate.
     """
 
-    def __init__(self, x, y, values, label, n_range, share2, eps2, tallies=None, whole=False):
+    def __init__(self, x, y, values, label, n_range, errors, eps2, tallies=None, whole=False):
         self.pixels, self.label, self.n_range = (x, y, values), label, n_range
-        self.share2, self.eps2, self.tallies, self.whole = share2, eps2, tallies, whole
+        self.errors, self.eps2, self.tallies, self.whole = errors, eps2, tallies, whole
 
     def size(self, members):
         return int(np.isin(self.label, list(members)).sum())
@@ -120,10 +133,7 @@ class PlaneRatio:
         return 1 - total[1] / total[0], 1 - total[2] / total[0]
 
     def __call__(self, one, other):
-        channels = (self.n_range, self.pixels[2].shape[1] - self.n_range)
-        p = [3 * width for width in channels]
-        allowances = [k + 4 * (2 * k) ** 0.5 for k in p]
         gates = self.gates(one, other)
-        budgets = [self.share2 + eps2 * gate**2 for eps2, gate in zip(self.eps2, gates, strict=True)]
+        allowed2 = [eps2 * gate**2 for eps2, gate in zip(self.eps2, gates, strict=True)]
         a, b = (np.isin(self.label, list(m)) for m in (one, other))
-        return plane_ratio(*self.pixels, a, b, self.n_range, allowances, budgets, self.whole)
+        return plane_ratio(*self.pixels, a, b, self.n_range, self.errors, allowed2, self.whole)

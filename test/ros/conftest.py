@@ -2,7 +2,23 @@
 
 from __future__ import annotations
 
+import sys
+
 import pytest
+
+from rcseg_ros.live.shared_memory import clear_dead_segments
+
+
+@pytest.fixture(scope="session", autouse=True)
+def shared_memory():
+    """Leave nothing in /dev/shm, and no node running: what is killed, then or before, cannot clean up."""
+    clear_dead_segments()
+    yield
+    module = sys.modules.get("live")
+    for node in module.NodeProcess.started if module else ():
+        node.process.kill()
+        node.process.wait()
+    clear_dead_segments()
 
 
 @pytest.fixture(scope="module")
@@ -22,22 +38,22 @@ def live():
 @pytest.fixture
 def run(live, tmp_path):
     """Start nodes of given names, each with a peer; they end with the test, with exit code 0."""
-    started = []
+    processes, peers = [], []
 
     def start(name, parameters=None, outputs=tuple(live.OUTPUTS), *, active=True, **peer_options):
         remaps = {"__node": name, **live.input_topics(name)}
         process = live.NodeProcess(tmp_path / f"{name}.txt", parameters, remaps)
+        processes.append(process)  # before anything can fail: it must end with the test
         if active:
             process.wait_for_output("active")
-        peer = live.Peer(name, outputs, **peer_options)
-        started.append((process, peer))
-        return process, peer
+        peers.append(live.Peer(name, outputs, **peer_options))
+        return process, peers[-1]
 
     yield start
-    for _, peer in started:
+    for peer in peers:
         peer.close()
-    for process, _ in started:
-        code, _ = process.stop()
+    stopped = [process.stop()[0] for process in processes]  # all of them, before any is judged
+    for code, process in zip(stopped, processes, strict=True):
         assert code == 0, process.output()
         assert "Traceback" not in process.output(), process.output()
 

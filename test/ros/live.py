@@ -5,36 +5,47 @@ listens.
 from __future__ import annotations
 
 import contextlib
+import ctypes
+import fcntl
 import os
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections import defaultdict
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PolygonInstanceStamped
 from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.srv import GetParameters, SetParameters, SetParametersAtomically
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+from sensor_msgs.msg import CameraInfo, Image, Imu, PointCloud2
 from visualization_msgs.msg import MarkerArray
 
 from rcseg_core import PinholeCamera, RangeColorFrame, SegmenterConfig, segment
-from rcseg_msgs.msg import RegionArray
-from rcseg_ros.conversions import Header
-from rcseg_ros.messages import make_rcl
-from rcseg_ros.outputs import cloud_message, depth_message, header_message, picture_message
+from rcseg_msgs.msg import ObjectArray, RegionArray, TrackArray
+from rcseg_ros.frames.conversions import Header
+from rcseg_ros.results.messages import make_rcl
+from rcseg_ros.results.outputs import cloud_message, depth_message, header_message, picture_message
 
-INPUTS = {"points": PointCloud2, "depth": Image, "image": Image, "camera_info": CameraInfo}
+INPUTS = {
+    "points": PointCloud2,
+    "depth": Image,
+    "image": Image,
+    "camera_info": CameraInfo,
+    "depth_camera_info": CameraInfo,
+    "imu": Imu,
+}
 OUTPUTS = {
     "labels": Image,
     "surface_labels": Image,
@@ -44,7 +55,35 @@ OUTPUTS = {
     "markers": MarkerArray,
     "reconstruction": PointCloud2,
 }
-DOMAIN = 1 + os.getpid() % 100  # of this test run alone
+#: What a robot takes of the results; the last three are silent where up is unknown.
+WORLD_OUTPUTS = {
+    "object_labels": Image,
+    "objects": ObjectArray,
+    "polygons": PolygonInstanceStamped,
+    "labelled_points": PointCloud2,
+    "class_mask": Image,
+    "ground_points": PointCloud2,
+    "obstacle_points": PointCloud2,
+}
+TRACK_OUTPUTS = {"tracks": TrackArray}
+
+
+def _own_domain() -> int:
+    """A ROS domain that no other test run on this machine has, held until this process ends."""
+    for domain in range(1, 101):
+        lock = open(Path(tempfile.gettempdir()) / f"rcseg-test-domain-{domain}", "w")  # noqa: SIM115
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            lock.close()
+            continue
+        _HELD.append(lock)
+        return domain
+    raise RuntimeError("a hundred test runs at a time have all ROS domains")
+
+
+_HELD: list[Any] = []
+DOMAIN = _own_domain()
 PROFILE = Path(__file__).parents[2] / "config" / "fastdds_large_messages.xml"
 ISOLATED = {
     "ROS_DOMAIN_ID": str(DOMAIN),
@@ -55,6 +94,8 @@ ISOLATED = {
 FRAME_ID = "camera_color_optical_frame"
 CAMERA = PinholeCamera(180.0, 180.0, 79.5, 59.5)
 SECOND = 1_000_000_000
+_LIBC = ctypes.CDLL(None)
+_PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
 def scene(seed: int = 0, height: int = 120, width: int = 160) -> RangeColorFrame:
@@ -115,8 +156,9 @@ def camera_info_of(frame: RangeColorFrame, stamp_ns: int, distortion: tuple[floa
 
 
 def image_array(message: Image) -> np.ndarray:
-    """Pixels of a 16UC1, 8UC1 or rgb8 output."""
-    kind, channels = {"16UC1": ("<u2", 1), "8UC1": ("u1", 1), "rgb8": ("u1", 3)}[message.encoding]
+    """Pixels of a 16UC1, 8UC1, mono8 or rgb8 output."""
+    kinds = {"16UC1": ("<u2", 1), "8UC1": ("u1", 1), "mono8": ("u1", 1), "rgb8": ("u1", 3)}
+    kind, channels = kinds[message.encoding]
     pixels = np.frombuffer(message.data, kind).reshape(message.height, message.width, channels)
     return pixels[..., 0] if channels == 1 else pixels
 
@@ -146,8 +188,16 @@ def assert_same(one: Any, other: Any, path: str = "message") -> None:
         np.testing.assert_array_equal(one, other, path)
 
 
+def _as_nohup_starts_it() -> None:
+    """In the child: SIGINT ignored; and it ends with this run, even where that is killed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+
+
 class NodeProcess:
     """The executable segmentation_node, in a process and a session of its own."""
+
+    started: ClassVar[list[NodeProcess]] = []
 
     def __init__(
         self, log: Path, parameters: dict[str, Any] | None = None, remaps: dict[str, str] | None = None
@@ -162,7 +212,9 @@ class NodeProcess:
             self.process = subprocess.Popen(
                 [sys.executable, "-m", "rcseg_ros.node", *arguments],
                 stdout=output, stderr=subprocess.STDOUT, env=environment(), start_new_session=True,
+                preexec_fn=_as_nohup_starts_it,
             )  # fmt: skip
+        NodeProcess.started.append(self)
 
     def output(self) -> str:
         return self._log.read_text(errors="replace")
@@ -177,7 +229,7 @@ class NodeProcess:
         if self.process.poll() is None:
             self.process.send_signal(how)
         try:
-            return self.process.wait(timeout_s), time.monotonic() - started
+            return self.process.wait(timeout_s * patience()), time.monotonic() - started
         except subprocess.TimeoutExpired:
             self.process.kill()
             self.process.wait()
@@ -191,12 +243,17 @@ def environment() -> dict[str, str]:
     return os.environ | ISOLATED
 
 
+def patience() -> float:
+    """By how much everything may take longer than on a machine with nothing else to do, 1 there to 10."""
+    return min(max(os.getloadavg()[0] / (os.cpu_count() or 1), 1.0), 10.0)
+
+
 def wait_until(
     condition: Callable[[], Any], timeout_s: float, explain: Callable[[], Any] = lambda: ""
 ) -> Any:
-    """Poll until the condition is true and return its value."""
-    end = time.monotonic() + timeout_s
-    while time.monotonic() < end:
+    """Poll until the condition is true and return its value; times are those of an idle machine."""
+    started = time.monotonic()
+    while time.monotonic() < started + timeout_s * patience():
         value = condition()
         if value:
             return value
@@ -204,11 +261,21 @@ def wait_until(
     raise AssertionError(f"not within {timeout_s} s: {explain()}")
 
 
+def _values(message: DiagnosticArray) -> dict[str, str]:
+    status = message.status[0]
+    texts = {"level": str(status.level), "message": status.message}
+    return {value.key: value.value for value in status.values} | texts
+
+
 class Peer:
     """A node in this process: publishers of the inputs, a record of the outputs, clients of the services."""
 
     def __init__(
-        self, node_name: str = "rcseg", outputs: tuple[str, ...] = tuple(OUTPUTS), reliable: bool = True
+        self,
+        node_name: str = "rcseg",
+        outputs: tuple[str, ...] = tuple(OUTPUTS),
+        reliable: bool = True,
+        topics: dict[str, str] | None = None,
     ) -> None:
         os.environ.update(ISOLATED)
         self._context = Context()
@@ -218,12 +285,12 @@ class Peer:
         self.arrived_s: dict[str, list[float]] = defaultdict(list)
         reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
         qos = QoSProfile(depth=10, reliability=reliability)
-        topics = input_topics(node_name)
+        topics = input_topics(node_name) | (topics or {})
         self.publishers = {
             name: self.node.create_publisher(kind, topics[name], qos) for name, kind in INPUTS.items()
         }
         for name in outputs:
-            self._listen(name, OUTPUTS[name], f"/{node_name}/{name}")
+            self._listen(name, (OUTPUTS | WORLD_OUTPUTS | TRACK_OUTPUTS)[name], f"/{node_name}/{name}")
         self._listen("diagnostics", DiagnosticArray, "/diagnostics")
         self._clients: dict[str, Any] = {}
         self._prefix = f"/{node_name}"
@@ -252,7 +319,7 @@ class Peer:
         """Wait until the node reads these inputs and its outputs are heard here."""
         wait_until(lambda: all(self.publishers[i].get_subscription_count() for i in inputs), timeout_s)
         wait_until(lambda: self.node.count_publishers(f"{self._prefix}/labels"), timeout_s)
-        time.sleep(0.5)  # the node's side of the discovery
+        time.sleep(0.5 * patience())  # the node's side of the discovery
 
     def publish(self, **messages: Any) -> None:
         for name, message in messages.items():
@@ -274,13 +341,18 @@ class Peer:
 
     def diagnostics(self) -> dict[str, str]:
         """Values of the latest diagnostics, and its level and message under those names."""
-        if not self.received["diagnostics"]:
-            return {}
-        status = self.received["diagnostics"][-1].status[0]
-        return {v.key: v.value for v in status.values} | {
-            "level": str(status.level),
-            "message": status.message,
-        }
+        return _values(self.received["diagnostics"][-1]) if self.received["diagnostics"] else {}
+
+    def heard_that(self, condition: Callable[[dict[str, str]], Any]) -> dict[str, str] | None:
+        """The first diagnostics for which the condition holds; a later one may say something else."""
+        return next((d for d in map(_values, list(self.received["diagnostics"])) if condition(d)), None)
+
+    def diagnosed(
+        self, what: str | Callable[[dict[str, str]], Any], timeout_s: float = 20.0
+    ) -> dict[str, str]:
+        """Wait for diagnostics whose message contains the words, or for which the condition holds."""
+        condition = what if callable(what) else lambda values: what in values["message"]
+        return wait_until(lambda: self.heard_that(condition), timeout_s, self.diagnostics)
 
     def count(self, key: str) -> int:
         """A counter of the diagnostics; 0 before it is first counted."""

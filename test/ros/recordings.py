@@ -11,9 +11,9 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
 
 from rcseg_core import PinholeCamera, RangeColorFrame
-from rcseg_ros.conversions import Header
-from rcseg_ros.outputs import cloud_message, depth_message, header_message, picture_message
-from rcseg_ros.result_bag import BagWriter, definition_text, make_message, result_types, serialize
+from rcseg_ros.frames.conversions import Header
+from rcseg_ros.recordings.result_bag import BagWriter, definition_text, make_message, result_types, serialize
+from rcseg_ros.results.outputs import cloud_message, depth_message, header_message, picture_message
 
 HEIGHT, WIDTH = 48, 64
 CAMERA = PinholeCamera(60.0, 60.0, 31.5, 23.5)

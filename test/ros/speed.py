@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 
 from rcseg_core import SegmenterConfig, segment
-from rcseg_core.parallel import set_threads, threads
+from rcseg_core.compute.parallel import set_threads, threads
 from rcseg_core.synthetic import make_scene
 
 REFERENCE = Path(__file__).with_name("speed_reference.json")

@@ -25,10 +25,11 @@ from recordings import (
     write_mcap,
 )
 
-from rcseg_ros.bag import Recording
+from rcseg_core.errors import InputError
 from rcseg_ros.cli import main
-from rcseg_ros.outputs import depth_message, picture_message
-from rcseg_ros.result_bag import make_message
+from rcseg_ros.recordings.bag import Recording
+from rcseg_ros.recordings.result_bag import make_message
+from rcseg_ros.results.outputs import depth_message, picture_message
 
 
 @pytest.fixture
@@ -72,6 +73,32 @@ def test_a_file_that_is_no_recording(refused, tmp_path):
     rubbish = tmp_path / "rubbish.mcap"
     rubbish.write_bytes(b"rubbish" * 100)
     assert "cannot be read" in refused("replay", rubbish)
+
+
+@pytest.fixture
+def nobody():
+    """Permissions as those of a user that owns nothing; root's own pass over all."""
+    if os.geteuid():
+        yield
+        return
+    os.seteuid(65534)
+    yield
+    os.seteuid(0)
+
+
+@pytest.fixture(params=["file", "folder"])
+def closed(request, tmp_path):
+    """A recording that may not be read, or whose folder may not be looked into."""
+    bag = write_folder(tmp_path / "closed", cloud_entries(1))
+    place = bag if request.param == "folder" else next(bag.glob("*.mcap"))
+    place.chmod(0)
+    yield bag
+    place.chmod(0o755)
+
+
+def test_a_recording_that_may_not_be_read(closed, nobody):
+    with pytest.raises(InputError, match=r"closed.*: cannot be read: Permission denied"):
+        Recording(closed)
 
 
 @pytest.mark.parametrize("compression", ["zstd", "none"])
@@ -177,7 +204,19 @@ def test_stamps_that_never_meet(refused, recording):
         if entry.topic == COLOR:
             entry.message.header = head(entry.log_ns + 45_000_000)
     error = refused("replay", recording(entries))
-    assert "within 20 ms" in error and "--slop" in error and "2 unpaired_range" in error
+    assert "within 20 ms" in error and "--slop 46" in error and "2 unpaired_range" in error
+    assert "45 ms after the range stamp, steadily" in error
+
+
+def test_stamps_of_two_clocks(refused, recording):
+    """Time since the start of the machine beside the time of day: no slop helps."""
+    entries = depth_entries(2)
+    for i, entry in enumerate(entries):
+        if entry.topic == COLOR:
+            entry.message.header = head(12_345_000_000 + 100_000_000 * (i // 3))
+    error = refused("replay", recording(entries))
+    assert "two clocks" in error and "1700000000.000 to 1700000000.100 s" in error
+    assert "12.345 to 12.445 s" in error and "a larger slop does not help" in error
 
 
 def npz(path, **arrays):
@@ -211,6 +250,34 @@ def test_archives_without_the_arrays(refused, tmp_path):
     text = tmp_path / "c.npz"
     text.write_text("not an archive")
     assert "c.npz: not an .npz archive" in refused("segment", text)
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [("empty.npz", b""), ("cut.npz", b"PK\x03\x04 and no more"), ("one.npz", b"\x93NUMPY and no more")],
+)
+def test_files_that_are_no_archive(refused, tmp_path, name, content):
+    (tmp_path / name).write_bytes(content)
+    for command in ("segment", "evaluate"):
+        assert f"{name}: not an .npz archive of arrays" in refused(command, tmp_path / name)
+
+
+def test_a_single_array_is_no_archive(refused, tmp_path):
+    np.save(tmp_path / "points.npy", GOOD["points"])
+    assert "a single array, saved by np.save" in refused("segment", tmp_path / "points.npy")
+
+
+def test_every_fault_of_a_frame_names_its_file(refused, tmp_path):
+    eight = npz(tmp_path / "eight.npz", color=GOOD["color"], depth=np.ones((8, 9), np.uint8), K=np.eye(3))
+    for command in ("segment", "evaluate"):
+        assert "eight.npz: depth: expected" in refused(command, eight)
+    sizes = npz(tmp_path / "sizes.npz", **{**GOOD, "color": GOOD["color"][:7]})
+    assert "sizes.npz: points are 9x8 and color is 9x7" in refused("segment", sizes)
+    color, depth = tmp_path / "color.png", tmp_path / "depth.png"
+    cv2.imwrite(str(color), np.zeros((7, 9, 3), np.uint8))
+    cv2.imwrite(str(depth), np.full((8, 9), 1000, np.uint16))
+    options = ("--depth", depth, "--intrinsics", "5,5,4,4")
+    assert "depth.png: points are 9x8" in refused("segment", "--color", color, *options)
 
 
 def test_pictures_that_do_not_fit(refused, tmp_path):
@@ -266,10 +333,20 @@ def test_unwritable_output(refused, recording, tmp_path):
     (tmp_path / "a_file").write_text("")
     assert "a_file: is a file" in refused("replay", bag, "-o", tmp_path / "a_file")
     assert "is not a folder" in refused("replay", bag, "-o", tmp_path / "a_file" / "out")
-    assert "is not a folder" in refused("replay", bag, "-o", tmp_path / "nowhere" / "out")
     assert "cannot write" in refused("config", "--yaml", tmp_path / "nowhere" / "my.yaml")
     frame = npz(tmp_path / "frame.npz", **GOOD)
     assert "is a file" in refused("segment", frame, "-o", tmp_path / "a_file")
+
+
+def test_folders_above_the_output_are_made_and_kept_only_with_it(refused, recording, tmp_path):
+    colors = [entry for entry in depth_entries(1) if entry.topic == COLOR]
+    refused("replay", write_folder(tmp_path / "bad", colors), "-o", tmp_path / "a" / "b" / "out")
+    assert not (tmp_path / "a").exists()
+    frame = npz(tmp_path / "frame.npz", **GOOD)
+    assert main(["segment", str(frame), "-o", str(tmp_path / "a" / "b" / "frame")]) == 0
+    assert main(["replay", str(recording(depth_entries(1))), "-o", str(tmp_path / "a" / "c" / "out")]) == 0
+    assert (tmp_path / "a" / "b" / "frame" / "labels.png").is_file()
+    assert (tmp_path / "a" / "c" / "out" / "metrics.json").is_file()
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
@@ -284,7 +361,7 @@ def test_usage(refused, recording):
     assert "Missing argument" in refused("replay")
     assert "No such command" in refused("segmentate")
     assert "--workers" in refused("replay", "in", "--workers", "0")
-    assert "expected one of labels" in refused("replay", "in", "--outputs", "labels,pictures")
+    assert "expected one of all, usual, labels" in refused("replay", "in", "--outputs", "labels,pictures")
 
 
 def test_inspect_of_something_else(refused, recording):
@@ -323,4 +400,5 @@ def test_interrupt_leaves_a_readable_result(workers, tmp_path):
     with Recording(tmp_path / "out") as result:
         count = result.topics["/rcseg/labels"].count
         assert result.damage == [] and 0 < count < frames
-        assert all(topic.count == count for topic in result.topics.values())
+        once = set(result.topics) - {"/rcseg/polygons"}  # one message a plane
+        assert {result.topics[name].count for name in once} == {count}

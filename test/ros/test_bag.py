@@ -30,11 +30,11 @@ from recordings import (
 from rosbags.highlevel import AnyReader
 
 from rcseg_core import InputError
-from rcseg_ros.bag import Recording
-from rcseg_ros.conversions import decode_cloud, decode_depth, decode_image
-from rcseg_ros.outputs import depth_message, labels_message, picture_message
-from rcseg_ros.result_bag import definition_text, make_message, message_definitions, result_types
-from rcseg_ros.topics import InputTopics, find_topics
+from rcseg_ros.frames.conversions import decode_cloud, decode_depth, decode_image
+from rcseg_ros.recordings.bag import Recording
+from rcseg_ros.recordings.result_bag import definition_text, make_message, message_definitions, result_types
+from rcseg_ros.recordings.topics import InputTopics, find_topics
+from rcseg_ros.results.outputs import depth_message, labels_message, picture_message
 
 BAGS = Path(__file__).resolve().parents[2] / "bags"
 
@@ -83,9 +83,12 @@ def test_messages_are_typed_and_counted(tmp_path):
 def test_a_folder_without_metadata_is_read_and_the_lack_told(tmp_path):
     bag = write_folder(tmp_path / "bag", depth_entries(2))
     (bag / "metadata.yaml").unlink()
-    found, damage = contents(bag)
-    assert len(found) == 6
-    assert len(damage) == 1 and "metadata" in damage[0]
+    with Recording(bag) as recording:
+        assert len(list(recording.messages(recording.topics))) == 6
+        assert recording.damage == []
+        assert recording.warnings == [
+            f"{bag}: no metadata.yaml in this folder; bag.mcap read in the order of time"
+        ]
 
 
 @pytest.mark.parametrize("compression", ["zstd", "lz4", "none"])
@@ -136,6 +139,14 @@ def test_a_file_with_nothing_to_read_is_refused(content, tmp_path):
 def test_a_recording_without_any_message_is_refused(tmp_path):
     with pytest.raises(InputError, match="no message"):
         Recording(write_mcap(tmp_path / "bag.mcap", []))
+
+
+def test_latched_messages_come_before_the_frames_wherever_they_lie(tmp_path):
+    last = stamps(2)[-1] + 1
+    static = Entry("/robot/tf_static", make_message("tf2_msgs/msg/TFMessage", transforms=[]), last)
+    with Recording(write_mcap(tmp_path / "bag.mcap", [*depth_entries(2), static])) as recording:
+        assert [type(m).__name__ for m in recording.latched()] == ["tf2_msgs__msg__TFMessage"]
+        assert recording.latched("/nothing") == []
 
 
 def test_a_message_that_is_none_is_told(tmp_path):
@@ -246,9 +257,22 @@ def test_metadata_has_the_form_of_a_recorded_bag(tmp_path, shared_data):
     assert (information["version"], information["storage_identifier"]) == (9, "mcap")
 
 
+def test_results_name_the_distribution_of_their_types(tmp_path):
+    bag = write_folder(tmp_path / "bag", depth_entries(1))
+    text = (bag / "metadata.yaml").read_text()
+    assert yaml.safe_load(text)["rosbag2_bagfile_information"]["ros_distro"] == "jazzy"
+    with (bag / "bag.mcap").open("rb") as stream:
+        (record,) = make_reader(stream).iter_metadata()
+    assert yaml.safe_load(record.metadata["serialized_metadata"])["ros_distro"] == "jazzy"
+
+
 def test_definitions_keep_their_comments_and_match_the_built_messages():
-    text = definition_text("rcseg_msgs/msg/RegionArray")
-    sections = text.split("=" * 80 + "\n")
+    arrays = ("RegionArray", "ObjectArray", "TrackArray")
+    sections = [
+        section
+        for name in arrays
+        for section in definition_text(f"rcseg_msgs/msg/{name}").split("=" * 80 + "\n")
+    ]
     for name, original in message_definitions().items():
         assert any(original.strip() in section for section in sections), name
     assert {s.splitlines()[0] for s in sections[1:]} >= {"MSG: std_msgs/Header", "MSG: rcseg_msgs/Region"}
@@ -303,3 +327,27 @@ def test_recordings_do_not_change_when_read(tmp_path):
     before = {file.name: file.read_bytes() for file in copy.iterdir()}
     contents(copy)
     assert {file.name: file.read_bytes() for file in copy.iterdir()} == before
+
+
+def test_first_messages_are_found_by_one_reading(tmp_path, monkeypatch):
+    folder = write_folder(tmp_path / "in", depth_entries(3))
+    with Recording(folder) as recording:
+        expected = {topic: next(recording.messages([topic])) for topic in recording.topics}
+        readings, real = [], recording.messages
+        monkeypatch.setattr(recording, "messages", lambda *given: readings.append(given) or real(*given))
+        find_topics(recording, {})
+        assert {topic: recording.first_raw(topic) for topic in recording.topics} == expected
+        assert len(readings) == 1
+        assert recording.first_raw("/absent") is None
+
+
+def test_damage_is_counted_once_though_first_messages_are_looked_for_before(tmp_path):
+    path = write_mcap(tmp_path / "in.mcap", depth_entries(3))
+    damaged = path.read_bytes()
+    path.write_bytes(damaged[: len(damaged) * 2 // 3])
+    with Recording(path) as recording:
+        before = list(recording.damage)
+        inputs = find_topics(recording, {})
+        assert recording.damage == before
+        found = len(list(recording.messages(inputs.names())))
+        assert 0 < found < 9 and len(recording.damage) == 1

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from rcseg_core import SegmenterConfig, segment
-from rcseg_ros.assembly import assemble_frame
-from rcseg_ros.bag import Recording
-from rcseg_ros.topics import find_topics
+from rcseg_ros.frames.assembly import assemble_frame
+from rcseg_ros.recordings.bag import Recording
+from rcseg_ros.recordings.topics import find_topics
 
 ROOT = Path(__file__).parents[2]
 BAG = ROOT / "bags" / "tabletop"

@@ -7,13 +7,16 @@ import cv2
 import numpy as np
 import pytest
 
-from rcseg_core import SegmenterConfig, parallel, segment
+from rcseg_core import SegmenterConfig, segment
+from rcseg_core.compute import parallel
 from rcseg_core.errors import InputError
-from rcseg_core.evaluation import evaluate_scene
+from rcseg_core.evaluation.frames import evaluate_scene
 from rcseg_core.synthetic import make_scene
-from rcseg_ros import bench as bench_module
-from rcseg_ros import bench_report
-from rcseg_ros.bench import (
+from rcseg_ros.bench import report as bench_report
+from rcseg_ros.bench import run as bench_module
+from rcseg_ros.bench.peers import Peer, installed_peers
+from rcseg_ros.bench.probe import STATUS
+from rcseg_ros.bench.run import (
     FRAME,
     REGIONS,
     SEGMENT,
@@ -21,14 +24,13 @@ from rcseg_ros.bench import (
     BenchReport,
     Group,
     parse_threads,
+    python_calls,
     run_bench,
 )
-from rcseg_ros.bench_peers import Peer, installed_peers
-from rcseg_ros.bench_probe import STATUS
 from rcseg_ros.cli import main
 
 COLUMNS = ["group", "width", "height", "threads", "frames", "kind", "what"]
-FIGURES = ["runs", "median_ms", "p95_ms", "ratio"]
+FIGURES = ["runs", "median_ms", "p95_ms", "ratio", "python_calls"]
 TINY = ("--families", "room", "--sizes", "80x60,96x72", "--seeds", "100", "--repeat", "1")
 
 
@@ -48,6 +50,7 @@ def folder(tmp_path_factory):
 def test_a_run_writes_rows_and_plots(folder):
     rows = read_rows(folder / "bench.csv")
     assert list(rows[0]) == COLUMNS + FIGURES
+    assert all((row["what"] == SEGMENT) == (int(row["python_calls"] or 0) > 500) for row in rows)
     assert {(row["group"], row["width"], row["threads"]) for row in rows} == {
         ("room", "80", "1"),
         ("room", "96", "1"),
@@ -58,7 +61,7 @@ def test_a_run_writes_rows_and_plots(folder):
     assert document["machine"]["cores"] >= 1
     table = (folder / "bench.md").read_text("utf-8").splitlines()
     assert len(table) == 4 and table[2].startswith("| room | 80x60 | 1 | 1 | ")
-    assert {line.count("|") for line in table} == {9}
+    assert {line.count("|") for line in table} == {10}
     assert cv2.imread(str(folder / "stages.png")).shape[1] > 500
     assert cv2.imread(str(folder / "pixels.png")).shape[1] > 500
 
@@ -90,7 +93,7 @@ def test_the_screen_shows_recorded_frames_and_peers(tmp_path, capsys, monkeypatc
     np.savez(tmp_path / "seen.npz", points=frame.points, color=frame.color, K=matrix)
     calls = []
     peer = Peer("counting", lambda seen: lambda: calls.append(seen.width))
-    monkeypatch.setattr("rcseg_ros.bench.installed_peers", lambda: (peer,))
+    monkeypatch.setattr("rcseg_ros.bench.run.installed_peers", lambda: (peer,))
     source = str(tmp_path / "seen.npz")
     assert main(["bench", "--frames", source, "--repeat", "2", "--threads", "1", "--no-probe"]) == 0
     assert calls == [64, 64, 64]  # once to warm up, then in every round
@@ -100,8 +103,8 @@ def test_the_screen_shows_recorded_frames_and_peers(tmp_path, capsys, monkeypatc
 
 def test_labels_that_depend_on_threads_are_named(monkeypatch):
     sums = iter([1, 1, 2, 3])
-    monkeypatch.setattr("rcseg_ros.bench._measure", lambda *_: next(sums))
-    monkeypatch.setattr("rcseg_ros.bench.set_threads", lambda _: None)
+    monkeypatch.setattr("rcseg_ros.bench.run._measure", lambda *_: next(sums))
+    monkeypatch.setattr("rcseg_ros.bench.run.set_threads", lambda _: None)
     options = BenchOptions(
         families=("room",), sizes=((64, 48),), seeds=(1, 2), threads=(1, 2), peers=False, probe=False
     )
@@ -123,6 +126,14 @@ def test_ratio_pairs_the_times_of_one_round():
         ("peer", "peer", 10),
     ]
     assert np.isnan(rows[0]["ratio"]) and rows[1]["ratio"] == 2
+
+
+def test_python_calls_are_counted_and_calls_into_c_are_not():
+    def swapped(text):
+        return text[::-1]
+
+    assert python_calls(lambda: list(map(str.upper, "abc"))) == 1
+    assert python_calls(lambda: list(map(swapped, "abc"))) == 4
 
 
 def test_growth_is_against_the_pixels():

@@ -1,6 +1,7 @@
 """The command line: what each command prints and writes; help answers without loading the algorithm."""
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -17,6 +18,8 @@ from rcseg_ros.cli import Preset, main
 
 ROOT = Path(__file__).resolve().parents[2]
 BAGS = ROOT / "bags"
+COMMANDS = ["replay", "batch", "calibrate", "segment", "config", "evaluate", "bench", "warmup", "inspect",
+            "view"]  # fmt: skip
 
 
 @pytest.fixture
@@ -57,8 +60,28 @@ def test_inspect_lists_frames_and_regions(rcseg, tmp_path):
     regions = len(segment(scene(1), SegmenterConfig()).regions)
     shown = rcseg("inspect", "out", "--frame", 1)
     assert f"frame 1: {regions} regions" in shown
-    assert "surfaces; metres" in shown and "plane" in shown and "normal (" in shown
+    assert "surfaces; metres" in shown and "plane" in shown and "normal (" in shown and "offset +-" in shown
     assert "noise (estimated): range " in shown and " mm at the median depth of " in shown
+    assert "up: unknown" in shown and "objects; metres" in shown and "other" in shown
+
+
+def test_inspect_tells_classes_areas_and_objects(rcseg):
+    rcseg("replay", BAGS / "tabletop", "-o", "out", "--max-frames", 1)
+    shown = rcseg("inspect", "out", "--frame", 0)
+    assert "up: (" in shown and "floor 0." in shown and "horizontal 0." in shown
+    assert re.search(r"[3-9] objects; metres", shown) and "surface 2" in shown
+
+
+def check_world(folder, document, expected):
+    world = expected.world()
+    for name, image in (("object_labels", world.object_labels), ("class_mask", world.class_mask)):
+        np.testing.assert_array_equal(cv2.imread(str(folder / f"{name}.png"), cv2.IMREAD_UNCHANGED), image)
+    assert (document["up"] is None) == (world.up is None)
+    assert [o["label"] for o in document["objects"]] == [o.label for o in world.objects]
+    for told, surface in zip(document["surfaces"], expected.surfaces, strict=True):
+        assert told["category"] == surface.category
+        areas = [p["area_m2"] for p in told["polygons"]]
+        assert areas == [p.area for p in surface.polygons]
 
 
 def check_results(folder, frame):
@@ -82,12 +105,17 @@ def check_results(folder, frame):
         assert told["pixel_count"] == (surfaces == told["label"]).sum()
         assert told["regions"] == list(surface.regions)
         assert told["primitive"]["kind"] == surface.primitive.kind
+        if surface.plane is not None:
+            assert told["local"]["pose"] == surface.plane.pose.tolist()
+            assert told["local"]["covariance"] == surface.plane.covariance.tolist()
+            assert told["local"]["systematic"] == surface.plane.systematic.tolist()
         for name, value in surface.primitive.parameters.items():
             np.testing.assert_array_equal(told["primitive"]["parameters"][name], value)
             np.testing.assert_array_equal(
                 told["primitive"]["standard_errors"][name], surface.primitive.standard_errors[name]
             )
     assert document["surfaces"][0]["primitive"]["kind"] == "plane"
+    check_world(folder, document, expected)
     noise = document["noise"]
     depth, (a, b, c) = noise["median_depth_m"], noise["range_law"][0]
     assert noise["source"] == "estimated" and noise["range_unit"] == "1/m"
@@ -145,6 +173,35 @@ def test_a_ros_file_may_name_the_preset_and_the_option_goes_before_it(rcseg, tmp
     assert printed(rcseg, "-c", file, "-p", "accurate") == SegmenterConfig.preset("accurate")
 
 
+def completed(line, monkeypatch, capsys):
+    """What bash is offered for the last word of a line."""
+    words = line.split(" ")
+    monkeypatch.setenv("_RCSEG_COMPLETE", "complete_bash")
+    monkeypatch.setenv("COMP_WORDS", line)
+    monkeypatch.setenv("COMP_CWORD", str(len(words) - 1))
+    with pytest.raises(SystemExit):
+        main([])
+    return capsys.readouterr().out.split()
+
+
+@pytest.mark.parametrize(
+    ("line", "offered"),
+    [
+        ("rcseg ba", ["batch"]),
+        ("rcseg replay x --preset ", list(PRESETS)),
+        ("rcseg batch x --runner ", ["local", "ray"]),
+        ("rcseg calibrate x --range-from p", ["points"]),
+        ("rcseg view --up i", ["imu", "imu:"]),
+        ("rcseg replay x --outputs labels,over", ["labels,overlay"]),
+        ("rcseg evaluate synthetic --labels su", ["surfaces"]),
+        ("rcseg config --set grouping.max_g", ["grouping.max_gap="]),
+        ("rcseg evaluate synthetic --families blocks,roo", ["blocks,room"]),
+    ],
+)
+def test_completion_offers_the_words_of_options(line, offered, monkeypatch, capsys):
+    assert completed(line, monkeypatch, capsys) == offered
+
+
 def test_completion_knows_the_presets():
     assert [preset.value for preset in Preset] == list(PRESETS)
 
@@ -164,12 +221,12 @@ def test_a_ros_parameter_file_is_a_configuration_too(rcseg, tmp_path):
 def test_help_names_every_command_and_loads_no_algorithm():
     program = "import sys; from rcseg_ros.cli import main; main(['--help']); print('numba' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    for command in ("replay", "segment", "evaluate", "config", "inspect"):
+    for command in COMMANDS:
         assert command in done.stdout
     assert done.stdout.strip().endswith("False")
 
 
-@pytest.mark.parametrize("command", ["replay", "segment", "config", "inspect"])
+@pytest.mark.parametrize("command", COMMANDS)
 def test_each_command_explains_itself_with_an_example(rcseg, command):
     text = rcseg(command, "--help")
     assert "Example" in text and f"rcseg {command}" in text

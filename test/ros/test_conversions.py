@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from wire import CONTAINERS, cloud, image, reason
 
-from rcseg_ros.conversions import (
+from rcseg_core import PinholeCamera
+from rcseg_ros.frames.conversions import (
     Header,
-    MessageError,
     decode_camera_info,
     decode_cloud,
     decode_depth,
@@ -19,7 +20,7 @@ from rcseg_ros.conversions import (
     decode_labels,
     header_of,
 )
-from rcseg_ros.outputs import (
+from rcseg_ros.results.outputs import (
     cloud_message,
     depth_message,
     edges_message,
@@ -30,33 +31,6 @@ from rcseg_ros.outputs import (
 
 RNG = np.random.default_rng(7)
 COLOR = RNG.integers(0, 256, (6, 8, 3), np.uint8)
-CONTAINERS = {
-    "bytes": bytes,
-    "array": lambda raw: array.array("B", raw),
-    "numpy": lambda raw: np.frombuffer(raw, np.uint8),
-}
-
-
-def image(pixels, encoding, padding=0, big_endian=False, container="bytes"):
-    """Image message with `padding` bytes of rubbish after each row, its data in one of CONTAINERS."""
-    stored = np.ascontiguousarray(pixels.astype(pixels.dtype.newbyteorder(">" if big_endian else "<")))
-    rows = stored.view(np.uint8).reshape(pixels.shape[0], -1)
-    rows = np.hstack([rows, np.full((len(rows), padding), 0xAB, np.uint8)])
-    return SimpleNamespace(
-        height=pixels.shape[0],
-        width=pixels.shape[1],
-        encoding=encoding,
-        is_bigendian=int(big_endian),
-        step=rows.shape[1],
-        data=CONTAINERS[container](rows.tobytes()),
-    )
-
-
-def reason(function, *arguments):
-    with pytest.raises(MessageError) as caught:
-        function(*arguments)
-    assert str(caught.value) and "\n" not in str(caught.value)
-    return caught.value.reason
 
 
 @pytest.mark.parametrize("container", CONTAINERS)
@@ -130,10 +104,10 @@ def test_compressed_color(extension, tolerance):
 def test_depth_in_millimetres_zero_is_invalid():
     for encoding in ("16UC1", "mono16"):
         for big_endian in (False, True):
-            stored = np.array([[0, 1000, 65535]] * 2, np.uint16)
+            stored = np.array([[0, 1000, 65534]] * 2, np.uint16)
             depth_m = decode_depth(image(stored, encoding, 6, big_endian))
             assert depth_m.dtype == np.float32
-            np.testing.assert_allclose(depth_m, [[np.nan, 1.0, 65.535]] * 2, rtol=1e-6)
+            np.testing.assert_allclose(depth_m, [[np.nan, 1.0, 65.534]] * 2, rtol=1e-6)
 
 
 @pytest.mark.parametrize("big_endian", [False, True])
@@ -160,7 +134,7 @@ def test_what_is_wrong_with_an_image_is_named():
     assert reason(decode_image, SimpleNamespace(**{**vars(good), "encoding": "rgb7"})) == "unknown_encoding"
     assert reason(decode_image, SimpleNamespace(**{**vars(good), "data": good.data[:-1]})) == "truncated_data"
     assert reason(decode_image, SimpleNamespace(**{**vars(good), "data": b""})) == "truncated_data"
-    assert reason(decode_image, SimpleNamespace(**{**vars(good), "step": 3})) == "bad_step"
+    assert reason(decode_image, SimpleNamespace(**{**vars(good), "step": 3, "height": 5})) == "bad_step"
     assert reason(decode_image, SimpleNamespace(**{**vars(good), "height": 0})) == "empty_image"
     assert reason(decode_image, SimpleNamespace(format="jpeg", data=b"rubbish")) == "bad_compression"
     assert reason(decode_image, SimpleNamespace(format="jpeg", data=b"")) == "bad_compression"
@@ -172,31 +146,6 @@ def test_the_last_row_may_lack_its_padding():
     message = image(COLOR, "rgb8", 5)
     message.data = message.data[:-5]
     np.testing.assert_array_equal(decode_image(message), COLOR)
-
-
-KINDS = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
-
-
-def cloud(columns, shape, *, big_endian=False, gaps=0, row_padding=0):
-    """PointCloud2 from (name, numpy kind, values) in the given order, with unused bytes between and after."""
-    order = ">" if big_endian else "<"
-    offset, fields, dtype = 0, [], {"names": [], "formats": [], "offsets": []}
-    for name, kind, _ in columns:
-        offset += gaps
-        fields.append(SimpleNamespace(name=name, offset=offset, datatype=KINDS[kind], count=1))
-        dtype["names"].append(name)
-        dtype["formats"].append(order + kind)
-        dtype["offsets"].append(offset)
-        offset += np.dtype(kind).itemsize
-    table = np.zeros(shape, np.dtype({**dtype, "itemsize": offset + gaps}))
-    for name, _, values in columns:
-        table[name] = values
-    rows = np.frombuffer(table.tobytes(), np.uint8).reshape(shape[0], -1)
-    rows = np.hstack([rows, np.full((len(rows), row_padding), 0xCD, np.uint8)])
-    return SimpleNamespace(
-        height=shape[0], width=shape[1], fields=fields, is_bigendian=big_endian, is_dense=False,
-        point_step=table.dtype.itemsize, row_step=rows.shape[1], data=rows.tobytes(),
-    )  # fmt: skip
 
 
 POINTS = RNG.normal(size=(6, 8, 3)).astype(np.float32)
@@ -248,8 +197,8 @@ def test_what_is_wrong_with_a_cloud_is_named():
         return SimpleNamespace(**{**vars(cloud(xyz(), (6, 8))), **fields})
 
     assert reason(decode_cloud, changed(data=b"\0" * 10)) == "truncated_data"
-    assert reason(decode_cloud, changed(row_step=10)) == "bad_step"
-    assert reason(decode_cloud, changed(point_step=0)) == "bad_step"
+    assert reason(decode_cloud, changed(row_step=10, height=5)) == "bad_step"
+    assert reason(decode_cloud, changed(point_step=0, width=13, height=17)) == "bad_step"
     assert reason(decode_cloud, changed(width=0)) == "empty_cloud"
     assert reason(decode_cloud, cloud(xyz()[:2], (6, 8))) == "missing_field"
     bad = cloud(xyz(), (6, 8))
@@ -288,14 +237,21 @@ def test_camera_info_of_a_binned_region_of_interest():
     assert (camera.height, camera.width) == (100, 150)
 
 
-def test_distortion_is_kept_where_it_is_known_and_refused_where_not():
+def test_distortion_is_kept_and_calibration_is_k_or_p():
     assert decode_camera_info(camera_info(d=[0.1, 0, 0, 0, 0])).distortion == (0.1, 0, 0, 0, 0)
     rational = camera_info(distortion_model="rational_polynomial", d=[0.1] * 8 + [0.0] * 6)
-    assert len(decode_camera_info(rational).distortion) == 8
-    fisheye = camera_info(distortion_model="equidistant", d=[0.1, 0, 0, 0])
-    assert reason(decode_camera_info, fisheye) == "unknown_distortion"
+    assert len(decode_camera_info(rational).distortion) == 14
     assert decode_camera_info(camera_info(distortion_model="equidistant", d=[0.0] * 4)).distortion == ()
     assert reason(decode_camera_info, camera_info(k=np.zeros(9))) == "uncalibrated_camera"
+    p = np.array([400.0, 0, 310, -20, 0, 405, 230, 0, 0, 0, 1, 0])
+    assert decode_camera_info(camera_info(p=p)).projection == PinholeCamera(400, 405, 310, 230)
+    assert decode_camera_info(camera_info()).projection is None
+    rectified = decode_camera_info(camera_info(k=np.zeros(9), p=p, d=[0.1] * 5))
+    assert rectified.pinhole == PinholeCamera(400, 405, 310, 230)
+    assert rectified.only_projection and rectified.distortion == ()
+    roi = SimpleNamespace(x_offset=100, y_offset=40, height=200, width=300, do_rectify=False)
+    part = decode_camera_info(camera_info(p=p, roi=roi, binning_x=2, binning_y=2))
+    assert part.projection == PinholeCamera(200, 202.5, 105, 95)
 
 
 def make(type_name, **fields):

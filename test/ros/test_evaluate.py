@@ -8,13 +8,19 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-import rcseg_ros.evaluate as evaluate
+import rcseg_ros.evaluation.evaluate as evaluate
 from rcseg_core import SegmenterConfig
 from rcseg_core.errors import InputError
 from rcseg_core.synthetic import FAMILIES, make_scene
-from rcseg_ros.evaluate import run_evaluate
-from rcseg_ros.evaluate_options import SyntheticOptions, parse_families, parse_level, parse_seeds, parse_size
-from rcseg_ros.reports import markdown_tables
+from rcseg_ros.evaluation.evaluate import run_evaluate
+from rcseg_ros.evaluation.options import (
+    SyntheticOptions,
+    parse_families,
+    parse_level,
+    parse_seeds,
+    parse_size,
+)
+from rcseg_ros.evaluation.reports import markdown_tables
 
 SMALL = SyntheticOptions(families=("room", "painting"), seeds=(0, 1), width=160, height=120)
 
@@ -125,10 +131,78 @@ def test_both_levels_have_their_own_rows_and_pools(tmp_path, console):
     assert report.frames[0].blobs is not None and report.frames[1].blobs is None
 
 
+def test_objects_have_a_table_figures_and_a_picture(tmp_path, console):
+    report = run_evaluate(
+        "synthetic",
+        config=SegmenterConfig(),
+        console=console,
+        output=tmp_path / "out",
+        synthetic=SyntheticOptions(families=("room",), seeds=(21,), width=160, height=120),
+        level="objects",
+    )
+    (row,) = report.frame_rows(0.8)
+    assert row["labels"] == "objects" and row["objects"] >= 2 and 0 <= row["whole"] <= 1
+    assert row["best_iou"] > 0.7 and "correct" not in row
+    console.file.flush()
+    assert "whole" in screen(tmp_path) and "voi_bits" not in row
+    assert json.loads((tmp_path / "out" / "metrics.json").read_text())["pooled"][0]["labels"] == "objects"
+
+
+def test_recognised_planes_have_a_table_and_figures_of_their_own(tmp_path, console):
+    output = tmp_path / "out"
+    run_evaluate(
+        "synthetic", config=SegmenterConfig(), console=console, output=output, synthetic=SMALL, planes=True
+    )
+    document = json.loads((output / "metrics.json").read_text())
+    assert {row["labels"] for row in document["frames"] + document["pooled"]} == {"planes"}
+    room, _ = document["pooled"]
+    frames = [row for row in document["frames"] if row["group"] == "room"]
+    assert room["matched"] == sum(row["matched"] for row in frames) > 4
+    assert room["panoptic"] == pytest.approx(np.mean([row["panoptic"] for row in frames]))
+    for row in frames:
+        assert row["panoptic"] == pytest.approx(row["mean_iou"] * row["f_score"])
+        assert row["precision"] == row["matched"] / row["machine_planes"]
+    console.file.flush()
+    text = screen(tmp_path)
+    assert "Planes, by the rules of EVOPS" in text and f"{room['panoptic']:.3f}" in text
+    assert "truth of planes" not in text and (output / "index.html").exists()
+
+
+def test_planes_of_frames_without_truth_are_counted(tmp_path, console):
+    scene = make_scene("room", 1, width=160, height=120)
+    np.savez(tmp_path / "alone.npz", points=scene.frame.points, color=scene.frame.color)
+    report = run_evaluate(str(tmp_path), config=SegmenterConfig(), console=console, planes=True)
+    (alone,) = report.frames
+    assert alone.planes is None and alone.regions > 3 and 0.5 < alone.labelled <= 1
+
+
+def test_stated_errors_are_compared_with_the_truth(tmp_path, console):
+    output = tmp_path / "out"
+    arguments = {"config": SegmenterConfig(), "console": console, "synthetic": SMALL, "uncertainty": True}
+    report = run_evaluate("synthetic", output=output, **arguments)
+    assert report.frames == [] and len(report.checks) > 10
+    document = json.loads((output / "metrics.json").read_text())
+    pooled = {(row["what"], row["by"], row["class"]): row for row in document["uncertainty"]["pooled"]}
+    planes = [c for c in document["uncertainty"]["checks"] if c["what"] == "plane"]
+    assert pooled["plane", "all", ""]["count"] == len(planes)
+    assert pooled["plane", "all", ""]["nees"] == pytest.approx(np.mean([c["nees"] for c in planes]))
+    assert pooled["control points", "family", "painting"]["count"] > 1
+    with (output / "uncertainty.csv").open() as file:
+        assert len(list(csv.DictReader(file))) == len(pooled)
+    console.file.flush()
+    assert "Stated errors of planes" in screen(tmp_path) and "family painting" in screen(tmp_path)
+    with pytest.raises(InputError, match=r"--uncertainty: .* give `synthetic`"):
+        run_evaluate(str(tmp_path), **arguments)
+
+
 def test_levels_that_labels_asks_for():
     assert parse_level("auto", synthetic=True) == ("regions",)
     assert parse_level("auto", synthetic=False) == parse_level("both", synthetic=True)
     assert parse_level("surfaces", synthetic=True) == ("surfaces",)
+    assert parse_level("objects", synthetic=False) == ("objects",)
+    assert parse_level("auto", synthetic=True, planes=True) == ("planes",)
+    assert parse_level("both", synthetic=True, planes=True) == ("surfaces", "regions", "planes")
+    assert parse_level("auto", synthetic=True, uncertainty=True) == ()
 
 
 def test_an_interrupted_run_keeps_what_was_finished(tmp_path, console, monkeypatch):

@@ -18,8 +18,7 @@ import pytest
 import yaml
 
 ROOT = Path(__file__).parents[2]
-INPUTS = {"points", "depth", "image", "camera_info"}
-OUTPUTS = {"labels", "surface_labels", "regions", "overlay", "edges", "markers", "reconstruction"}
+INPUTS = {"points", "depth", "image", "camera_info", "depth_camera_info"}
 
 
 def _recorder(kind):
@@ -32,7 +31,8 @@ def recorded_launch(monkeypatch):
     names = {
         "launch": ["LaunchDescription"],
         "launch.actions": [
-            "DeclareLaunchArgument", "ExecuteProcess", "IncludeLaunchDescription", "SetEnvironmentVariable"
+            "DeclareLaunchArgument", "ExecuteProcess", "IncludeLaunchDescription", "LogInfo",
+            "OpaqueFunction", "SetEnvironmentVariable",
         ],
         "launch.conditions": ["IfCondition", "UnlessCondition"],
         "launch.launch_description_sources": ["PythonLaunchDescriptionSource"],
@@ -47,7 +47,9 @@ def recorded_launch(monkeypatch):
         module = types.ModuleType(name)
         module.__dict__.update({member: _recorder(member) for member in members})
         monkeypatch.setitem(sys.modules, name, module)
-    sys.modules["ament_index_python.packages"].get_package_share_directory = lambda package: str(ROOT)
+    packages = sys.modules["ament_index_python.packages"]
+    packages.get_package_share_directory = lambda package: str(ROOT)
+    packages.get_packages_with_prefixes = lambda: {"rviz2": "/opt/ros/jazzy"}
 
 
 def _load(name):
@@ -101,6 +103,27 @@ def test_replay_launch(recorded_launch):
     assert Path(rviz.named["arguments"][1]).is_file()
 
 
+def test_replay_without_rviz_goes_on_with_a_word(recorded_launch, monkeypatch):
+    """A node of a package that is missing ends the launch when others run already, which then live on."""
+    packages = sys.modules["ament_index_python.packages"]
+    monkeypatch.setattr(packages, "get_packages_with_prefixes", dict)
+    _, actions = _load("replay")
+    assert not [a for a in actions if a.kind == "Node"]
+    (word,) = [a for a in actions if a.kind == "LogInfo"]
+    assert "rviz2 is not installed" in word.named["msg"] and _used(word) == {"rviz"}
+
+
+def test_a_config_file_that_is_missing_is_refused_before_anything_starts(recorded_launch, monkeypatch):
+    _, actions = _load("segment")
+    assert actions[0].kind == "OpaqueFunction"
+    check = actions[0].named["function"]
+    given = SimpleNamespace(perform=lambda context: context)
+    monkeypatch.setitem(check.__globals__, "LaunchConfiguration", lambda name: given)
+    check(str(ROOT / "config" / "default.yaml"))
+    with pytest.raises(RuntimeError, match=r"config:=/nowhere.yaml: no such file"):
+        check("/nowhere.yaml")
+
+
 @pytest.mark.skipif(
     not importlib.util.find_spec("launch_ros"), reason="launch_ros comes with a ROS installation"
 )
@@ -114,11 +137,17 @@ def test_the_real_launch_loads_the_files(name, monkeypatch):
     assert module.generate_launch_description().entities
 
 
+SHOWN = {
+    "labels", "overlay", "markers", "reconstruction", "class_mask", "object_labels", "ground_points",
+    "obstacle_points",
+}  # fmt: skip
+
+
 def test_rviz_shows_outputs_of_the_node():
     config = yaml.safe_load((ROOT / "config/rcseg.rviz").read_text())
     displays = config["Visualization Manager"]["Displays"]
     topics = {d["Topic"]["Value"].removeprefix("/rcseg/") for d in displays if "Topic" in d}
-    assert topics == {"labels", "overlay", "markers", "reconstruction"} and topics <= OUTPUTS
+    assert topics == SHOWN
 
 
 def test_foxglove_layout_shows_outputs_of_the_node():
@@ -126,7 +155,7 @@ def test_foxglove_layout_shows_outputs_of_the_node():
     panels = layout["configById"]
     shown = {c["imageMode"]["imageTopic"] for c in panels.values() if "imageMode" in c}
     shown |= panels["3D!scene"]["topics"].keys()
-    assert {t.removeprefix("/rcseg/") for t in shown} == {"labels", "overlay", "markers", "reconstruction"}
+    assert {t.removeprefix("/rcseg/") for t in shown} == SHOWN
 
     def leaves(node):
         return [node] if isinstance(node, str) else leaves(node["first"]) + leaves(node["second"])

@@ -6,20 +6,22 @@ import re
 from copy import copy
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from rcseg_core import PinholeCamera, RangeColorFrame, SegmenterConfig, segment
-from rcseg_core.primitives import NONE
+from rcseg_core.shapes.primitives import NONE
 from rcseg_core.synthetic import make_scene
-from rcseg_ros.conversions import Header
-from rcseg_ros.messages import region_array
-from rcseg_ros.outputs import header_message
+from rcseg_ros.frames.conversions import Header
 from rcseg_ros.patches import evaluate_patch, surface_points
-from rcseg_ros.result_bag import make_message, serialize
+from rcseg_ros.recordings.result_bag import make_message, serialize
+from rcseg_ros.results.markers import draw
+from rcseg_ros.results.messages import region_array
+from rcseg_ros.results.outputs import header_message
 
+OF_REGIONS = {"surfaces", "boxes", "normals", "labels"}
 MSG = Path(__file__).parents[2] / "rcseg_msgs" / "msg"
 
 
@@ -46,7 +48,7 @@ def test_every_field_is_commented():
     for path in MSG.glob("*.msg"):
         lines = path.read_text().splitlines()
         for i, line in enumerate(lines):
-            if re.match(r"[a-z]\w*(/\w+)?(\[\d*\])?\s+[a-z]", line):
+            if re.match(r"[a-z]\w*(/\w+)?(\[[<=\d]*\])?\s+[a-z]", line):
                 documented = "#" in line or path.stem == "PixelBox"  # its head says all
                 assert documented, f"{path.name}:{i + 1}: {line}"
 
@@ -97,7 +99,7 @@ def test_both_message_libraries_give_the_same_message(live, case):
     from rclpy.serialization import deserialize_message
 
     from rcseg_msgs.msg import RegionArray
-    from rcseg_ros.messages import make_rcl
+    from rcseg_ros.results.messages import make_rcl
 
     frame, result, message = case
     of_rclpy = region_array(frame, result, header_message(Header(5, "f"), make_rcl), make_rcl)
@@ -157,9 +159,42 @@ def test_surfaces_hold_their_regions_and_a_shape(case):
         assert 3e-4 < shape.rms < 2e-3 and 0.5 < shape.rms_sigma < 2
 
 
+def test_shapes_are_told_in_minimal_local_form(case):
+    _frame, result, message = case
+    told = {name: sum(len(getattr(s, name)) for s in message.surfaces) for name in ("plane", "sphere")}
+    assert told["plane"] == sum(s.primitive.kind == 1 for s in message.surfaces) > 1 and told["sphere"] == 0
+    for surface, core in zip(message.surfaces, result.surfaces, strict=True):
+        for plane in surface.plane:
+            matrix, at = core.plane.pose, plane.pose.position
+            turn = Rotation.from_quat([getattr(plane.pose.orientation, axis) for axis in "xyzw"])
+            np.testing.assert_allclose(turn.as_matrix(), matrix[:3, :3], atol=1e-9)
+            np.testing.assert_allclose((at.x, at.y, at.z), matrix[:3, 3])
+            np.testing.assert_array_equal(np.reshape(plane.covariance, (3, 3)), core.plane.covariance)
+            np.testing.assert_array_equal(np.reshape(plane.systematic, (3, 3)), core.plane.systematic)
+
+
+def test_balls_and_cylinders_are_told_in_minimal_local_form():
+    scene = make_scene("curved", 1, width=320, height=240)
+    result = segment(scene.frame)
+    header = header_message(Header(5, "f"), make_message)
+    message = region_array(scene.frame, result, header, make_message)
+    counts = dict.fromkeys(("sphere", "cylinder"), 0)
+    for surface, core in zip(message.surfaces, result.surfaces, strict=True):
+        for name in counts:
+            for form in getattr(surface, name):
+                wanted = getattr(core, name)
+                assert form.radius == wanted.radius
+                np.testing.assert_array_equal(form.covariance, wanted.covariance.ravel())
+                counts[name] += 1
+    assert min(counts.values()) > 0, counts
+    kinds = [s.primitive.kind for s in message.surfaces]
+    assert counts == {"sphere": kinds.count(2), "cylinder": kinds.count(3)}
+    serialize(message)
+
+
 def test_no_shape_is_told_as_none(case):
     frame, result, _ = case
-    shapeless = [replace(surface, primitive=NONE) for surface in result.surfaces]
+    shapeless = [replace(surface, primitive=NONE, local=None) for surface in result.surfaces]
     other = copy(result)
     other.__dict__["surfaces"] = shapeless
     message = region_array(frame, other, header_message(Header(5, "f"), make_message), make_message)
@@ -167,6 +202,7 @@ def test_no_shape_is_told_as_none(case):
     for surface in message.surfaces:
         shape = surface.primitive
         assert shape.kind == len(shape.parameters) == len(shape.covariance) == 0
+        assert len(surface.plane) == len(surface.sphere) == len(surface.cylinder) == 0
         assert np.isnan([shape.rms, shape.rms_sigma, shape.misfit, shape.p_value]).all()
 
 
@@ -188,39 +224,23 @@ def test_the_noise_is_told_with_its_unit(case):
 
 
 def test_markers_draw_every_region(case):
-    from rcseg_ros.markers import marker_array
-
     _, result, message = case
-
-    def make(type_name, **fields):
-        return SimpleNamespace(type_name=type_name, **fields)
-
-    first, *markers = marker_array(message, result.labels, make).markers
-    assert first.action == 3, "what was drawn before is deleted"
+    markers = draw(message, result.labels)
     for region in message.regions:
-        mine = {m.ns: m for m in markers if m.id == region.label}
-        assert mine.keys() == {"surfaces", "boxes", "normals", "labels"}
+        mine = {m.name: m for m in markers if m.label == region.label and m.name in OF_REGIONS}
+        assert mine.keys() == OF_REGIONS
         assert len(mine["boxes"].points) == 24 and len(mine["normals"].points) == 2
-        corners = np.array([(p.x, p.y, p.z) for p in mine["surfaces"].points])
+        corners = mine["surfaces"].points
         assert len(corners) % 3 == 0
         center = np.array([region.centroid.x, region.centroid.y, region.centroid.z])
         assert np.linalg.norm(corners.mean(axis=0) - center) < 0.2
 
 
 def test_markers_draw_spheres_and_cylinders_where_they_are():
-    from rcseg_ros.markers import marker_array
-
-    def make(type_name, **fields):
-        return SimpleNamespace(type_name=type_name, **fields)
-
     scene = make_scene("curved", 1, width=320, height=240)
     result = segment(scene.frame)
     message = region_array(scene.frame, result, header_message(Header(5, "f"), make_message), make_message)
-    drawn = {
-        m.id: np.array([(p.x, p.y, p.z) for p in m.points])
-        for m in marker_array(message, result.labels, make).markers[1:]
-        if m.ns == "shapes"
-    }
+    drawn = {m.label: m.points for m in draw(message, result.labels) if m.name == "shapes"}
     kinds = {s.label: s.primitive for s in result.surfaces if s.primitive.kind in ("sphere", "cylinder")}
     assert drawn.keys() == kinds.keys() and {k.kind for k in kinds.values()} == {"sphere", "cylinder"}
     for label, shape in kinds.items():

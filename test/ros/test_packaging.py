@@ -66,7 +66,8 @@ def test_both_commands_are_installed(wheel):
 
 def test_the_installed_package_finds_its_message_definitions(wheel):
     program = (
-        "from rcseg_ros.result_bag import definition_text; print(definition_text('rcseg_msgs/msg/Region'))"
+        "from rcseg_ros.recordings.result_bag import definition_text\n"
+        "print(definition_text('rcseg_msgs/msg/Region'))"
     )
     environment = {**os.environ, "PYTHONPATH": str(wheel)}
     done = subprocess.run(

@@ -49,7 +49,7 @@ def test_every_file_in_config_holds_known_parameters_within_bounds(path):
             parameter = known[key]
             expected = list if parameter.type is tuple else parameter.type
             assert type(value) is expected, f"{key} = {value!r}: ROS wants exactly {expected.__name__}"
-            if parameter.choices:
+            if parameter.choices and parameter.type is str:
                 assert value in parameter.choices
             if key in {p.key for p in describe(SegmenterConfig())}:
                 changes[key] = value
@@ -100,7 +100,10 @@ def test_a_change_takes_effect_with_the_next_frame(live, peer):
     ("changes", "words"),
     [
         ({"grouping__range_tolerance": 2.0}, "out of range"),
-        ({"grouping__range_tolerance": 1}, "expected 'Type.DOUBLE'"),
+        ({"grouping__range_tolerance": 1}, "out of range"),
+        ({"grouping__range_tolerance": "wide"}, "expected 'Type.DOUBLE'"),
+        ({"seeds__min_window": 3.5}, "expected 'Type.INTEGER'"),
+        ({"sync__offset_ms": "later"}, "expected a number or auto"),
         ({"grouping__criterion": "guess"}, "expected one of bounded, chow, bayes"),
         ({"seeds__min_window": 4}, "expected an odd whole number from 3 to 31 px"),
         ({"seeds__min_window": 13}, "larger than seeds.max_window"),
@@ -116,6 +119,29 @@ def test_refusals_give_the_reason_and_change_nothing(peer, changes, words):
     (result,) = peer.set_parameters(**changes)
     assert not result.successful and words in result.reason
     assert peer.get_parameters(*names) == before
+
+
+def test_whole_numbers_are_taken_for_numbers_and_the_other_way_round(run):
+    """As users write them: `-p sync.slop_ms:=30`, `ros2 param set ... grouping.color_tolerance 20`."""
+    given = {
+        "autostart": False, "sync.slop_ms": 30, "qos.depth": 7.0, "edges.color_threshold": 40,
+        "input.extrinsic_translation": [0, 0, 1], "sync.offset_ms": 12,
+    }  # fmt: skip
+    _, peer = run("whole", given, (), active=False)
+    values = peer.get_parameters("sync.slop_ms", "qos.depth", "edges.color_threshold", "sync.offset_ms")
+    assert [values[0].double_value, values[2].double_value, values[3].double_value] == [30.0, 40.0, 12.0]
+    assert values[1].integer_value == 7
+    (moved,) = peer.get_parameters("input.extrinsic_translation")
+    assert list(moved.double_array_value) == [0.0, 0.0, 1.0]
+    results = peer.set_parameters(
+        sync__slop_ms=25,
+        seeds__min_window=5.0,
+        sync__offset_ms="auto",
+        input__extrinsic_translation=[0, 1, 0],
+    )
+    assert all(r.successful for r in results), results
+    assert peer.set_parameters_atomically(grouping__color_tolerance=21, sync__offset_ms=-3).successful
+    assert peer.get_parameters("grouping.color_tolerance")[0].double_value == 21.0
 
 
 def test_a_preset_fills_in_what_was_not_given(live, run):

@@ -12,8 +12,8 @@ import pytest
 from rich.console import Console
 
 from rcseg_core import SegmenterConfig
-from rcseg_ros.evaluate import run_evaluate
-from rcseg_ros.references import read_reference
+from rcseg_ros.evaluation.evaluate import run_evaluate
+from rcseg_ros.evaluation.references import read_reference
 
 REFERENCE = read_reference(Path(__file__).resolve().parents[1] / "data" / "real_frames.yaml")
 

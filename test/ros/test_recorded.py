@@ -5,10 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import zstandard
+from recordings import COLOR, depth_entries, head, write_mcap, write_sqlite
 
 from rcseg_core.datasets import REGIONS
 from rcseg_core.errors import InputError
-from rcseg_ros.recorded import find_sources, group_of, read_recording
+from rcseg_ros.recordings.recorded import find_sources, group_of, read_recording
 
 BAGS = Path(__file__).resolve().parents[2] / "bags"
 
@@ -80,6 +82,35 @@ def test_a_damaged_recording_gives_what_comes_before_the_damage(tmp_path):
     assert next(frames).name == "cut/0"
     with pytest.raises(InputError, match="damaged"):
         list(frames)
+
+
+def test_sqlite3_and_packed_recordings_are_found_by_their_own_path_and_in_folders(tmp_path):
+    (file,) = write_sqlite(tmp_path / "bag", depth_entries(2)).glob("*.db3")
+    data = tmp_path / "data"
+    data.mkdir()
+    file = file.rename(data / "one.db3")
+    plain = write_mcap(tmp_path / "two.mcap", depth_entries(3))
+    (data / "two.mcap.zstd").write_bytes(zstandard.ZstdCompressor().compress(plain.read_bytes()))
+    assert [(s.name, s.frames) for s in find_sources(data)] == [("one", 2), ("two", 3)]
+    (source,) = find_sources(file)
+    assert [frame.name for frame in source.read()] == ["one/0", "one/1"]
+
+
+def test_a_recording_whose_stamps_never_meet_is_told_not_left_out(tmp_path):
+    entries = depth_entries(3)
+    for entry in entries:
+        if entry.topic == COLOR:
+            entry.message.header = head(entry.log_ns + 45_000_000)
+    (source,) = find_sources(write_mcap(tmp_path / "apart.mcap", entries))
+    with pytest.raises(InputError, match=r"apart\.mcap: no frame: .* 45 ms after the range stamp, steadily"):
+        list(source.read())
+
+
+def test_a_ros1_bag_in_place_of_data_is_named_as_such(tmp_path):
+    path = tmp_path / "old.bag"
+    path.write_bytes(b"#ROSBAG V2.0\n" + bytes(100))
+    with pytest.raises(InputError, match="ROS 1 bag; convert it"):
+        find_sources(path)
 
 
 @pytest.mark.parametrize(

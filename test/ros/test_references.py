@@ -7,10 +7,10 @@ import pytest
 import yaml
 
 from rcseg_core.errors import InputError
-from rcseg_core.metrics import PartMetrics, SceneMetrics
+from rcseg_core.evaluation.metrics import PartMetrics, SceneMetrics
 from rcseg_ros.cli import main
-from rcseg_ros.evaluate import Report
-from rcseg_ros.references import TOLERANCES, Reference, read_reference, write_reference
+from rcseg_ros.evaluation.evaluate import Report
+from rcseg_ros.evaluation.references import TOLERANCES, Reference, read_reference, write_reference
 
 
 def report(*, purity=0.99, parts=2.0, regions=20, names=("mosd_a", "mosd_b"), face_faults=None):

@@ -22,12 +22,12 @@ from recordings import (
 )
 
 from rcseg_core import InputError, Segmentation, SegmenterConfig, segment
-from rcseg_core.parallel import cores, threads
-from rcseg_ros.bag import Recording
-from rcseg_ros.conversions import decode_cloud, decode_image, decode_labels, header_of
-from rcseg_ros.outputs import labels_message
-from rcseg_ros.replay import ReplayRequest, replay
-from rcseg_ros.result_bag import make_message
+from rcseg_core.compute.parallel import cores, threads
+from rcseg_ros.commands.replay import ReplayRequest, replay
+from rcseg_ros.frames.conversions import decode_cloud, decode_image, decode_labels, header_of
+from rcseg_ros.recordings.bag import Recording
+from rcseg_ros.recordings.result_bag import make_message
+from rcseg_ros.results.outputs import labels_message
 
 CONFIG = SegmenterConfig()
 BAGS = Path(__file__).resolve().parents[2] / "bags"
@@ -210,7 +210,7 @@ def test_a_fault_in_mid_run_leaves_what_was_finished(tmp_path, monkeypatch):
             raise RuntimeError("fault")
         return segment(frame, config)
 
-    monkeypatch.setattr("rcseg_ros.segmenting.segment", faulty)
+    monkeypatch.setattr("rcseg_ros.recordings.segmenting.segment", faulty)
     with pytest.raises(RuntimeError, match="fault"):
         run(write_folder(tmp_path / "in", depth_entries(3)), tmp_path / "out", workers=1)
     assert len(messages(tmp_path / "out", "labels")) == 2
@@ -273,3 +273,28 @@ def test_the_real_laptop_recording_equals_segment(shared_data, tmp_path):
         assert 0.8 < summary.frames[0]["valid_share"] < 0.95
     first, second = (decode_labels(messages(tmp_path / name, "labels")[0]) for name in ("points", "depth"))
     np.testing.assert_array_equal(first, second)
+
+
+def test_a_camera_info_that_was_recorded_last_holds_for_all_frames(tmp_path):
+    entries = depth_entries(60)
+    (*_, last) = (entry for entry in entries if "info" in entry.topic)
+    bag = write_folder(tmp_path / "in", [e for e in entries if "info" not in e.topic] + [last])
+    summary = run(bag, tmp_path / "out", outputs=("labels",))
+    assert len(summary.frames) == 60 and not summary.dropped.total()
+
+
+@pytest.mark.parametrize("late_ms", [700, 2000])
+def test_images_of_a_clock_that_is_late_are_told(late_ms, tmp_path):
+    """By less than a second they pair exactly, each with one of another moment."""
+    entries = depth_entries(30)
+    for entry in entries:
+        if entry.topic == COLOR:
+            entry.message.header = head(entry.log_ns - late_ms * 1_000_000)
+    bag = write_folder(tmp_path / "in", entries)
+    words = f"those of {COLOR} {late_ms / 1000:.2f} s: if that is by two clocks"
+    if late_ms > 1000:
+        with pytest.raises(InputError, match=words):
+            run(bag, tmp_path / "out")
+    else:
+        summary = run(bag, tmp_path / "out", outputs=("labels",))
+        assert len(summary.frames) == 23 and words in summary.warnings[0]

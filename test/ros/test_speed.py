@@ -11,7 +11,7 @@ import time
 import pytest
 import speed
 
-pytestmark = pytest.mark.speed
+pytestmark = pytest.mark.alone
 LOOKS = 5
 
 

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rcseg_ros.sync import FrameSync
+from rcseg_ros.frames.sync import FrameSync, explain_gap, explain_lag
 
 MS = 1_000_000
 
@@ -169,3 +169,78 @@ def test_memory_is_bounded(live):
     assert dropped(sync) == {
         "queue_full_range": 996, "queue_full_color": 996, "unpaired_range": 4, "unpaired_color": 4
     }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("ranges", "colors", "words"),
+    [
+        ([0, 100, 200], [45, 145, 245], ["3 of 3", "45 ms after", "steadily", "--slop 46"]),
+        ([50, 150, 250], [5, 105, 205], ["45 ms before", "steadily", "--slop 46"]),
+        ([0, 100, 200, 300], [0, 100, 245, 300], ["1 of 4", "45 ms after"]),
+        ([0, 100, 200], [30, 190, 260], ["3 of 3 have none within 5 ms", "not synchronised"]),
+        ([0, 33, 66, 100, 133, 166], [0, 100], ["4 of 6", "colour images are missing"]),
+        ([0, 100], [10_000_000, 10_000_100], ["two clocks", "0.000 to 0.100 s", "10000.000 to 10000.100 s"]),
+        ([10_000_000, 10_000_100], [0, 100], ["two clocks"]),
+        ([0, 4, 8], [4], ["every frame has a colour image within the slop"]),
+        ([], [1], [""]),
+        ([1], [], [""]),
+    ],
+)
+def test_words_for_stamps_that_do_not_meet(ranges, colors, words):
+    text = explain_gap([t * MS for t in ranges], [t * MS for t in colors], 5 * MS)
+    assert all(word in text for word in words) and bool(text) == bool(words[0])
+
+
+def test_clocks_that_differ_show_in_the_time_to_the_recording():
+    near, far = [20 * MS, 25 * MS, 22 * MS], [2300 * MS, 2302 * MS, 2305 * MS]
+    assert explain_lag("/depth", near, "/image", [400 * MS] * 3) == ""
+    text = explain_lag("/depth", near, "/image", far)
+    assert "/depth lie 0.02 s" in text and "/image 2.30 s" in text
+    assert explain_lag("/depth", far, "/image", near) and not explain_lag("/depth", [], "/image", near)
+
+
+def test_a_range_of_another_camera_waits_for_its_own_camera_info():
+    sync = FrameSync(needs_camera=True, needs_range_camera=lambda pair: pair.color == "other")
+    assert sync.add_camera(0, "colour's") == []
+    sync.add_range(5, "depth")
+    (pair,) = sync.add_color(5, "same")
+    assert (pair.camera, pair.range_camera) == ("colour's", None)
+    sync.add_range(9, "depth")
+    assert sync.add_color(9, "other") == []
+    (pair,) = sync.add_range_camera(0, "depth's")
+    assert (pair.stamp_ns, pair.camera, pair.range_camera) == (9, "colour's", "depth's")
+
+
+@pytest.mark.parametrize("waiting", [(), (5,), (5, 9), (0, 4, 8), (2, 3, 10, 11)])
+def test_the_nearest_stamp_is_that_of_all_that_wait(waiting):
+    from rcseg_ros.frames.sync import _Stream
+
+    stream = _Stream("range", 30)
+    for stamp in waiting:
+        stream.add(stamp, None)
+    for wanted in range(-3, 16):
+        nearest = min(waiting, key=lambda stamp: (abs(stamp - wanted), stamp), default=None)
+        assert stream.nearest(wanted) == nearest
+
+
+def test_what_waits_when_time_begins_anew_is_counted():
+    sync = FrameSync(live=True, needs_camera=True)
+    feed_in = {"r": sync.add_range, "c": sync.add_color}
+    for kind, stamp in [("r", 1), ("c", 1), ("r", 50), ("c", 100), ("c", 150)]:
+        feed_in[kind](stamp * MS, stamp)
+    sync.start_anew()
+    assert dropped(sync) == {"unpaired_range": 1, "unpaired_color": 2}
+    assert len(sync.add_camera(0, "camera")) == 1  # what is paired waits on for its camera
+
+    sync.add_range(1 * MS, 1)
+    sync.let_go()
+    sync.let_go()
+    assert dropped(sync) == {"unpaired_range": 2, "unpaired_color": 2}
+
+
+def test_pairs_that_wait_for_a_camera_are_let_go_with_the_rest():
+    sync = FrameSync(live=True, needs_camera=True)
+    sync.add_range(1 * MS, 1)
+    sync.add_color(1 * MS, 1)
+    sync.let_go()
+    assert dropped(sync) == {"no_camera_info": 1} and sync.add_camera(0, "camera") == []

@@ -51,8 +51,7 @@ def test_shapes_and_noise_arrive_with_the_regions_and_in_diagnostics(live, peer,
         np.testing.assert_array_equal(told.primitive.parameters, np.concatenate(values) if values else [])
     assert [r.persistence for r in array.regions] == [r.persistence for r in expected.regions]
     assert array.noise.source == "estimated"
-    live.wait_until(lambda: "noise.source" in peer.diagnostics(), 5, peer.diagnostics)
-    values = peer.diagnostics()
+    values = peer.diagnosed(lambda told: "noise.source" in told)
     assert values["noise.source"] == "estimated"
     assert float(values["noise.range_sigma_mm"]) == pytest.approx(1e3 * array.noise.sigma, abs=0.006)
     assert float(values["noise.at_median_depth_m"]) == pytest.approx(array.noise.depth, abs=0.006)

@@ -1,8 +1,10 @@
 """A long compile is announced while it lasts, a warm start says nothing; after `rcseg warmup` nothing is left
 to compile, and it says where the kernels lie."""
 
+import contextlib
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,7 +13,7 @@ from rcseg_core import SegmenterConfig
 from rcseg_core.config import describe
 from rcseg_ros import warmup
 from rcseg_ros.cli import main
-from rcseg_ros.health import Health
+from rcseg_ros.live.health import Health
 
 BAGS = Path(__file__).resolve().parents[2] / "bags"
 
@@ -63,7 +65,7 @@ import recordings
 from rcseg_core import RangeColorFrame, SegmenterConfig, segment
 from rcseg_core.synthetic import make_scene
 from rcseg_ros import warmup
-from rcseg_ros.replay import ReplayRequest, replay
+from rcseg_ros.commands.replay import ReplayRequest, replay
 def signatures():
     return {{(k.__module__, k.__name__, str(types)) for k in warmup._kernels() for types in k.signatures}}
 warmup.fill_cache()
@@ -84,6 +86,24 @@ assert not late, sorted(late)
     assert done.returncode == 0, done.stderr
 
 
+def test_the_first_frame_after_a_start_loads_no_kernel():
+    """In a process of its own: whatever a frame of full height needs, the warm-up has loaded."""
+    program = """
+from rcseg_core import SegmenterConfig, segment
+from rcseg_core.synthetic import make_scene
+from rcseg_ros import warmup
+def signatures():
+    return {(k.__module__, k.__name__, str(types)) for k in warmup._kernels() for types in k.signatures}
+frame = make_scene("room", 6, width=240, height=320, structured_light=True).frame
+warmup.warm_up(SegmenterConfig(), print)
+before = signatures()
+segment(frame, SegmenterConfig())
+print("new:", sorted(signatures() - before))
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=600)
+    assert done.stdout.splitlines()[-1] == "new: []", done.stdout + done.stderr
+
+
 def test_the_command_tells_time_and_place(capsys, monkeypatch):
     seen = []
     monkeypatch.setattr(warmup, "_use", lambda frame, config: seen.append(config))
@@ -91,7 +111,7 @@ def test_the_command_tells_time_and_place(capsys, monkeypatch):
     text = " ".join(capsys.readouterr().out.split())
     assert len(seen) > 15 and " MB kept in " in text
     place = Path(text.partition(" MB kept in ")[2].split()[0])
-    assert any(place.glob("kernels-grouping-*")), place
+    assert any(place.glob("kernels-graph.grouping-*")), place
 
 
 def test_kernels_that_cannot_be_kept_are_an_error(capsys, monkeypatch, tmp_path):
@@ -126,23 +146,51 @@ def test_diagnostics_tell_of_the_compile_while_it_lasts():
     assert message("inactive") == "inactive"
 
 
-def test_the_node_reports_each_step_of_its_compile(live, monkeypatch):
+def test_the_node_answers_and_reports_while_it_compiles(live, monkeypatch):
+    """Services and diagnostics go on during a configure of seconds, asked for by a service itself."""
+    from rclpy.context import Context
+    from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+
     from rcseg_ros import node as node_module
 
-    said, reported = [], []
-
     def compile_slowly(config, announce):
-        announce("Compiling ...")
-        announce("  still compiling, 10 s")
-        return 12.0
+        for beat in range(4):
+            announce(f"  still compiling, {beat} s")
+            time.sleep(1)
+        return 4.0
 
     monkeypatch.setattr(node_module, "warm_up", compile_slowly)
-    node = SimpleNamespace(
-        health=Health(),
-        parameters=SimpleNamespace(config=SegmenterConfig()),
-        get_logger=lambda: SimpleNamespace(info=said.append),
-        _report=lambda: reported.append(node.health._progress),
-    )
-    assert node_module.SegmentationNode._compile(node) == 12.0
-    assert said == ["Compiling ...", "  still compiling, 10 s"]
-    assert reported == ["Compiling ...", "still compiling, 10 s"] and node.health._progress == ""
+    for name, value in live.ISOLATED.items():
+        monkeypatch.setenv(name, value)
+    context = Context()
+    node_module.rclpy.init(context=context, args=["--ros-args", "-r", "__node:=compiling"])
+    node = node_module.SegmentationNode(context=context)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+
+    def spin():
+        with contextlib.suppress(ExternalShutdownException):
+            executor.spin()
+
+    thread = threading.Thread(target=spin)
+    thread.start()
+    monkeypatch.setattr(node_module.rclpy, "ok", lambda: context.ok())
+    peer = live.Peer("compiling", ())
+    try:
+        assert peer.state() == "unconfigured"
+        asked = threading.Thread(target=lambda: peer.change_state("configure"))
+        asked.start()
+        live.wait_until(lambda: peer.diagnostics().get("message", "").startswith("still compiling"), 10)
+        started, answered = time.monotonic(), 0
+        while asked.is_alive():
+            peer.state()
+            assert peer.get_parameters("input.queue")[0].integer_value == 1
+            answered += asked.is_alive()
+        assert answered > 3 and time.monotonic() - started < 30
+        assert peer.state() == "inactive"
+    finally:
+        peer.close()
+        node.close()
+        context.try_shutdown()
+        thread.join(10)
+        node.destroy_node()
