@@ -8,9 +8,9 @@ import numpy as np
 from recording import InputBag, camera_info
 
 from rcseg_core import PinholeCamera, RangeColorFrame
-from rcseg_ros.conversions import Header
-from rcseg_ros.outputs import cloud_message, depth_message, header_message, picture_message
-from rcseg_ros.result_bag import make_message
+from rcseg_ros.frames.conversions import Header
+from rcseg_ros.recordings.result_bag import make_message
+from rcseg_ros.results.outputs import cloud_message, depth_message, header_message, picture_message
 
 
 def main() -> None:

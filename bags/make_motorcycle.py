@@ -9,9 +9,9 @@ from recording import InputBag, camera_info
 from skimage.data import stereo_motorcycle
 
 from rcseg_core import PinholeCamera
-from rcseg_ros.conversions import Header
-from rcseg_ros.outputs import depth_message, header_message, picture_message
-from rcseg_ros.result_bag import make_message
+from rcseg_ros.frames.conversions import Header
+from rcseg_ros.recordings.result_bag import make_message
+from rcseg_ros.results.outputs import depth_message, header_message, picture_message
 
 # From the documentation of skimage.data.stereo_motorcycle: pixels of the images scaled down by four.
 FOCAL_PX, CX_PX, CY_PX, DOFFS_PX, BASELINE_M = 994.978, 311.193, 254.877, 31.086, 0.193001

@@ -8,9 +8,9 @@ from recording import InputBag, camera_info
 from scipy.spatial.transform import Rotation
 
 from rcseg_core.synthetic import make_tabletop_sequence
-from rcseg_ros.conversions import Header
-from rcseg_ros.outputs import depth_message, header_message, labels_message, picture_message
-from rcseg_ros.result_bag import make_message
+from rcseg_ros.frames.conversions import Header
+from rcseg_ros.recordings.result_bag import make_message
+from rcseg_ros.results.outputs import depth_message, header_message, labels_message, picture_message
 
 FRAMES, SEED, PERIOD_NS, START_NS = 12, 3, 100_000_000, 1_700_000_000_000_000_000
 CAMERA_FRAME, WORLD_FRAME = "camera_color_optical_frame", "world"

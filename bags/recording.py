@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 
 from rcseg_core import PinholeCamera
-from rcseg_ros.conversions import Header
-from rcseg_ros.outputs import header_message
-from rcseg_ros.result_bag import BagWriter, make_message, serialize
+from rcseg_ros.frames.conversions import Header
+from rcseg_ros.recordings.result_bag import BagWriter, make_message, serialize
+from rcseg_ros.results.outputs import header_message
 
 HERE = Path(__file__).resolve().parent
 

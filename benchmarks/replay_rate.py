@@ -24,42 +24,48 @@ from time import perf_counter, thread_time
 
 import numpy as np
 
-from rcseg_core import SegmenterConfig, segment
-from rcseg_core.parallel import cores, set_threads
+from rcseg_core import RangeColorFrame, SegmenterConfig, segment
+from rcseg_core.compute.parallel import cores, set_threads
 from rcseg_core.synthetic import make_scene
-from rcseg_ros.assembly import assemble_frame
-from rcseg_ros.bag import Recording
-from rcseg_ros.conversions import Header, header_of
-from rcseg_ros.outputs import header_message, picture_message
-from rcseg_ros.replay import ReplayRequest, replay
-from rcseg_ros.result_bag import BagWriter, make_message, serialize
-from rcseg_ros.results import ResultMessages
-from rcseg_ros.segmenting import OUTPUTS, frame_row
-from rcseg_ros.sync import FrameSync
-from rcseg_ros.topics import find_topics
+from rcseg_ros.commands.replay import ReplayRequest, replay
+from rcseg_ros.frames.assembly import assemble_frame
+from rcseg_ros.frames.conversions import Header, header_of
+from rcseg_ros.frames.sync import FrameSync
+from rcseg_ros.recordings.bag import RawMessage, Recording
+from rcseg_ros.recordings.result_bag import BagWriter, make_message, serialize
+from rcseg_ros.recordings.segmenting import OUTPUTS, Segmented, frame_row, serialized
+from rcseg_ros.recordings.topics import find_topics
+from rcseg_ros.results.made import ResultMessages
+from rcseg_ros.results.outputs import header_message, picture_message
+from rcseg_ros.tables.rows import frame_tables
 from rcseg_ros.warmup import warm_up
 
 PERIOD_NS = 33_000_000
+ROW = {"segment_cpu_ms": 0.0, "camera": {"matrix": "K", "why": "", "registration": ""}}
 
 
 def main() -> None:
     options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     options.add_argument("recording", nargs="?", type=Path, help="instead of synthetic rooms")
     options.add_argument("--frames", type=int, default=24, help="frames of a round")
-    options.add_argument("--rounds", type=int, default=5)
+    options.add_argument("--rounds", type=int, default=5, help="0: only the processor time of each thing")
     options.add_argument("--workers", type=int, default=0, help="0: as many as processors")
     options.add_argument("--outputs", default="all")
     options.add_argument("--preset", default="balanced")
+    options.add_argument("--tables", action="store_true", help="write tables too")
     given = options.parse_args()
     config = SegmenterConfig.preset(given.preset)
     outputs = OUTPUTS if given.outputs == "all" else tuple(given.outputs.split(","))
     warm_up(config, print)
     with tempfile.TemporaryDirectory() as folder:
         bag = lengthen(given.recording, Path(folder) / "in", given.frames)
-        request = ReplayRequest(bag, Path(folder) / "out", config, outputs=outputs, workers=given.workers)
+        request = ReplayRequest(
+            bag, Path(folder) / "out", config, outputs=outputs, workers=given.workers, tables=given.tables
+        )
         frames = [frame for _, frame, _ in decoded(bag)]
-        compare(frames, request, given.rounds)
-        itemize(bag, config, outputs, Path(folder) / "again")
+        if given.rounds:
+            compare(frames, request, given.rounds)
+        itemize(bag, config, outputs, Path(folder) / "again", given.tables)
 
 
 def lengthen(recording: Path | None, target: Path, count: int) -> Path:
@@ -68,15 +74,7 @@ def lengthen(recording: Path | None, target: Path, count: int) -> Path:
         if recording is None:
             scenes = [make_scene("room", seed, width=640, height=480).frame for seed in range(min(count, 6))]
             for i, frame in enumerate(islice(cycle(scenes), count)):
-                head = header_message(Header(i * PERIOD_NS + 1, "camera"), make_message)
-                depth = np.nan_to_num(frame.depth_m * 1000).round().astype(np.uint16)
-                parts = {
-                    "/camera/camera_info": camera_info(frame.camera, *depth.shape, head),
-                    "/camera/depth": depth_message_of(depth, head),
-                    "/camera/image": picture_message(frame.color, head, make_message),
-                }
-                for topic, message in parts.items():
-                    bag.write(topic, message.__msgtype__, serialize(message), i * PERIOD_NS)
+                write_frame(bag, frame, i * PERIOD_NS + 1)
             return target
         with Recording(recording) as source:
             wanted = find_topics(source, {}).names()
@@ -91,6 +89,19 @@ def lengthen(recording: Path | None, target: Path, count: int) -> Path:
                     topic = source.topics[raw.topic]
                     bag.write(raw.topic, topic.type, bytes(data), raw.log_ns + again * span)
     return target
+
+
+def write_frame(bag: BagWriter, frame: RangeColorFrame, stamp_ns: int) -> None:
+    """Append a frame as depth in mm, colour and camera_info."""
+    head = header_message(Header(stamp_ns, "camera"), make_message)
+    depth = np.nan_to_num(frame.depth_m * 1000).round().astype(np.uint16)
+    parts = {
+        "/camera/camera_info": camera_info(frame.camera, *depth.shape, head),
+        "/camera/depth": depth_message_of(depth, head),
+        "/camera/image": picture_message(frame.color, head, make_message),
+    }
+    for topic, message in parts.items():
+        bag.write(topic, message.__msgtype__, serialize(message), stamp_ns)
 
 
 def depth_message_of(depth_mm, head):
@@ -156,7 +167,9 @@ def compare(frames, request: ReplayRequest, rounds: int) -> None:
     print(f"  {median(r[1] / r[2] for r in rows):.0%} of what the workers could reach with segment() alone")
 
 
-def itemize(bag: Path, config: SegmenterConfig, outputs: tuple[str, ...], folder: Path) -> None:
+def itemize(
+    bag: Path, config: SegmenterConfig, outputs: tuple[str, ...], folder: Path, tables: bool = False
+) -> None:
     """Processor time by what a replay does, one thread, medians over the frames."""
     set_threads(1)
     spent: dict[str, list[float]] = {}
@@ -179,13 +192,17 @@ def itemize(bag: Path, config: SegmenterConfig, outputs: tuple[str, ...], folder
                 timed("regions: patches", partial(getattr, result, "regions"))
                 timed("regions: merge tree", partial(getattr, result, "hierarchy"))
                 timed("regions: shapes of surfaces", partial(getattr, result, "surfaces"))
-            timed("metrics", partial(frame_row, header, 0, frame, result, 0.0))
+                timed("regions: world, objects", partial(getattr, result.world(), "objects"))
+            row = timed("metrics", partial(frame_row, header, 0, frame, result, 0.0))
             messages = ResultMessages(header, frame, result, make_message)
+            if tables:
+                made = Segmented(RawMessage("", 0, bytes(12)), header, frame, result, row | ROW, messages)
+                timed("tables", partial(frame_tables, made))
             for name in outputs:
-                message = timed(f"{name}: make", partial(getattr, messages, name))
-                data = timed(f"{name}: serialise", partial(serialize, message))
-                write = partial(writer.write, f"/{name}", message.__msgtype__, data, header.stamp_ns)
-                timed(f"{name}: write", write)
+                made = timed(f"{name}: make", partial(getattr, messages, name))
+                for one in timed(f"{name}: serialise", partial(serialized, name, made)):
+                    write = partial(writer.write, f"/{one.topic}", one.type, one.data, header.stamp_ns)
+                    timed(f"{name}: write", write)
     total = sum(median(times) for times in spent.values())
     print("processor time of one thread, milliseconds a frame")
     for what, times in spent.items():

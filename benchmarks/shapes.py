@@ -13,7 +13,7 @@ from collections import Counter
 import numpy as np
 
 from rcseg_core import segment
-from rcseg_core.shapes import fit_shape, start_cylinder, start_sphere
+from rcseg_core.shapes.fitting import fit_shape, start_cylinder, start_sphere
 from rcseg_core.synthetic import make_scene
 
 FAMILIES = ("room", "blocks", "curved", "billiard")
