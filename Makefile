@@ -7,22 +7,40 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 # Empty it (make test ROS=) to leave out the tests over live topics and the wheels and messages they need.
 ROS ?= 1
 
-.PHONY: demo test test-core check bench clean
+# How many tests run at a time. Those that measure time, marked `alone`, run after the others.
+WORKERS ?= 2
+# How long `make fuzz` draws hostile inputs.
+MINUTES ?= 10
+
+.PHONY: demo test test-core check bench clean ready fuzz
 
 demo: $(VENV)/.installed
 	@$(BIN)/rcseg replay bags/arc2017 --output demo --overlays --force
 
-test: $(VENV)/.tools $(if $(ROS),$(VENV)/.ros)
-	$(BIN)/python -m pytest
+test: $(VENV)/.tools
+	@$(MAKE) --no-print-directory --jobs=2 ready
+	$(BIN)/python -m pytest -m "not alone" --numprocesses=$(WORKERS) --dist=loadfile
+	$(BIN)/python -m pytest -m alone
 
 test-core: $(VENV)/.tools
 	$(BIN)/python -m pytest test/core test/oracle
+
+# The kernels are compiled once, while the messages are built, and not by every worker.
+ready: $(VENV)/.kernels $(if $(ROS),$(VENV)/.ros)
+
+$(VENV)/.kernels: $(VENV)/.tools $(wildcard rcseg_core/*.py rcseg_core/*/*.py)
+	@echo "Compiling the kernels (a minute or two, once)"
+	@$(BIN)/rcseg warmup > $@.log || { cat $@.log >&2; exit 1; }
+	@touch $@
 
 check: $(VENV)/.checkers
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/codespell
+
+fuzz: $(VENV)/.tools
+	$(BIN)/python benchmarks/fuzz.py --minutes $(MINUTES)
 
 bench: $(VENV)/.installed
 	@$(BIN)/rcseg bench

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from rcseg_core import RangeColorFrame, SegmenterConfig, segment
-from rcseg_core.drawing import contact_sheet, depth_picture, edges_picture, overlay, write_png
-from rcseg_ros.assembly import assemble_frame
-from rcseg_ros.bag import Recording
-from rcseg_ros.topics import find_topics
+from rcseg_core.result.drawing import contact_sheet, depth_picture, edges_picture, overlay, write_png
+from rcseg_ros.frames.assembly import assemble_frame
+from rcseg_ros.recordings.bag import Recording
+from rcseg_ros.recordings.topics import find_topics
 
 HERE = Path(__file__).resolve().parent
 

@@ -14,11 +14,11 @@ import cv2
 from rich.console import Console
 
 from rcseg_core import SegmenterConfig
-from rcseg_core.metrics import REPORT_TOLERANCE
-from rcseg_ros.evaluate import Report, run_evaluate
-from rcseg_ros.references import read_reference, write_reference
-from rcseg_ros.reports import markdown_tables
-from rcseg_ros.terminal import prepare
+from rcseg_core.evaluation.metrics import REPORT_TOLERANCE
+from rcseg_ros.commands.terminal import prepare
+from rcseg_ros.evaluation.evaluate import Report, run_evaluate
+from rcseg_ros.evaluation.references import read_reference, write_reference
+from rcseg_ros.evaluation.reports import markdown_tables
 
 HERE = Path(__file__).resolve().parent
 REFERENCE = HERE.parent / "test" / "data" / "real_frames.yaml"

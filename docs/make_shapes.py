@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 
 from rcseg_core import RangeColorFrame, Segmentation, segment
-from rcseg_core.drawing import KIND_COLORS, contact_sheet, kinds_picture, write_png
+from rcseg_core.result.drawing import KIND_COLORS, contact_sheet, kinds_picture, write_png
 from rcseg_core.synthetic import make_scene
-from rcseg_ros.assembly import assemble_frame
-from rcseg_ros.bag import Recording
-from rcseg_ros.topics import find_topics
+from rcseg_ros.frames.assembly import assemble_frame
+from rcseg_ros.recordings.bag import Recording
+from rcseg_ros.recordings.topics import find_topics
 
 HERE = Path(__file__).resolve().parent
 COLORS = KIND_COLORS | {"plane": (255, 255, 255)}
