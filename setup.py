@@ -4,6 +4,7 @@ from glob import glob
 from pathlib import Path
 
 from setuptools import find_packages, setup
+from setuptools.command.build_py import build_py
 
 ROS_PACKAGE = "rcseg_ros"
 SOURCES = Path(__file__).resolve().parent  # colcon build --symlink-install runs a link to this file
@@ -26,6 +27,20 @@ GENERATORS = [
     "rosidl-typesupport-fastrtps-cpp",
 ]
 
+
+
+class BuildWithDefinitions(build_py):
+    """The message definitions travel with the package as rcseg_ros/msg: result bags are written by them."""
+
+    def run(self) -> None:
+        super().run()
+        if not getattr(self, "editable_mode", False):  # an editable install finds them where they are
+            folder = Path(self.build_lib) / ROS_PACKAGE / "msg"
+            self.mkpath(str(folder))
+            for file in sorted((SOURCES / "rcseg_msgs" / "msg").glob("*.msg")):
+                self.copy_file(str(file), str(folder / file.name))
+
+
 setup(
     name="rcseg",
     version="0.1.0",
@@ -37,13 +52,8 @@ setup(
     license="Apache-2.0",
     python_requires=">=3.10",
     packages=find_packages(include=["rcseg_core", "rcseg_core.*", "rcseg_ros", "rcseg_ros.*"]),
-    # The message definitions (a link to rcseg_msgs/msg) travel with the Python package, to write result bags
-    # without built ones.
-    package_data={
-        "rcseg_core": ["py.typed"],
-        "rcseg_ros": ["msg/*.msg"],
-        "rcseg_ros.commands": ["page.html"],
-    },
+    package_data={"rcseg_core": ["py.typed"], "rcseg_ros.commands": ["page.html"]},
+    cmdclass={"build_py": BuildWithDefinitions},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{ROS_PACKAGE}"]),
         (f"share/{ROS_PACKAGE}", ["package.xml"]),
