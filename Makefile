@@ -7,7 +7,8 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 # Empty it (make test ROS=) to leave out the tests over live topics and the wheels and messages they need.
 ROS ?= 1
 
-# How many tests run at a time. Those that measure time, marked `alone`, run after the others.
+# How many tests run at a time. Those that measure time, marked `alone`, run after the others. What fails beside
+# other tests is told and runs once more alone: a machine that stands still for seconds is no fault of rcseg.
 WORKERS ?= 2
 # How long `make fuzz` draws hostile inputs.
 MINUTES ?= 10
@@ -19,7 +20,9 @@ demo: $(VENV)/.installed
 
 test: $(VENV)/.tools
 	@$(MAKE) --no-print-directory --jobs=2 ready
-	$(BIN)/python -m pytest -m "not alone" --numprocesses=$(WORKERS) --dist=loadfile
+	@$(BIN)/python -m pytest -m "not alone" --numprocesses=$(WORKERS) --dist=loadfile || \
+		{ echo "Once more, without others beside them: the tests that failed"; \
+		$(BIN)/python -m pytest --last-failed --last-failed-no-failures=none; }
 	$(BIN)/python -m pytest -m alone
 
 test-core: $(VENV)/.tools

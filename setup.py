@@ -28,7 +28,6 @@ GENERATORS = [
 ]
 
 
-
 class BuildWithDefinitions(build_py):
     """The message definitions travel with the package as rcseg_ros/msg: result bags are written by them."""
 

@@ -104,9 +104,12 @@ def _compressed(live, message, form, pixels):
 def _feed(
     live, peer, rounds=16, range_offset_ns=0, color_offset_ns=0, zero=(), camera=True, hz=4.0, stop=None
 ):
-    """Depth and colour at a rate, under stamps that lie apart; stops early when `stop` is true."""
+    """Depth and colour at a rate, under stamps that lie apart; where `stop` is given, until it is true.
+
+    `rounds` are those of an idle machine then.
+    """
     frame = live.scene()
-    for i in range(rounds):
+    for i in range(round(3 * rounds * live.patience()) if stop else rounds):
         stamp = T0 + round(i * 1e9 / hz)
         if camera:
             peer.publish(camera_info=live.camera_info_of(frame, stamp))
@@ -130,6 +133,7 @@ def _warned(peer, words):
     return peer.heard_that(lambda told: told["level"] == str(b"\x01") and words in told["message"])
 
 
+@pytest.mark.alone  # it tells how long that may take
 def test_color_that_is_late_is_told_and_taken_in_by_an_offset(live, run):
     process, peer = _started(run, "late")
     started_s = time.monotonic()

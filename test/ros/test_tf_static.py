@@ -4,6 +4,7 @@ it stands in geometry2; publisher and node run in the environment that sees it."
 from __future__ import annotations
 
 import importlib.util
+import itertools
 import os
 import subprocess
 import sys
@@ -96,11 +97,17 @@ def test_depth_is_registered_by_latched_transforms(live, broadcaster, with_tf2_m
     process.wait_for_output("active")
     peer = live.Peer("static_tf", ("regions",))
     peer.connected("depth", "image", "camera_info", "depth_camera_info")
-    stamp = 1_764_000_000 * live.SECOND
-    messages, normal = _depth_pair(live, stamp)
-    peer.publish(**messages)
+    stamps = itertools.count(1_764_000_000 * live.SECOND, live.SECOND)
+
+    def heard():  # a frame that overtakes the transforms is refused
+        messages, _ = _depth_pair(live, next(stamps))
+        peer.publish(**messages)
+        live.time.sleep(0.3)
+        return peer.received["regions"]
+
     try:
-        geometry = _seen(peer, live, stamp, normal)
+        stamp = live.stamp_of(live.wait_until(heard, 20, peer.diagnostics)[0])
+        geometry = _seen(peer, live, stamp, _depth_pair(live, stamp)[1])
     finally:
         peer.close()
         code, _ = process.stop()
