@@ -253,8 +253,8 @@ def wait_until(
 ) -> Any:
     """Poll until the condition is true and return its value.
 
-    Times are those of an idle machine, and far from what is usual: they only bound a failure. The average load
-    knows of other work too late, so each is allowed three times over.
+    Times are those of an idle machine, and far from what is usual: they only bound a failure. The average
+    load knows of other work too late, so each is allowed three times over.
     """
     started = time.monotonic()
     while time.monotonic() < started + 3 * timeout_s * patience():
