@@ -157,12 +157,28 @@ class FrameSync:
             range_: self.add_range,
         }
 
-    def start_anew(self) -> None:
-        """Let go of what waits for a partner; the camera stays, and so do pairs that wait for one."""
+    def start_anew(self, stamp_of: Callable[[Any], int | None] = lambda message: None) -> list[Pair]:
+        """Let go of what waits for a partner; the camera stays, and so do pairs that wait for one.
+
+        stamp_of : the stamp in nanoseconds under which a message is taken in again; None lets it go.
+
+        Returns the pairs that these make, oldest first.
+        """
+        kept = []
         for stream in (self._range, self._color):
-            self._drop(stream, list(stream.stamps), "unpaired")
+            for waiting in list(stream.stamps):
+                stamp = stamp_of(stream.messages[waiting])
+                if stamp is None:
+                    self._drop(stream, [waiting], "unpaired")
+                else:
+                    kept.append((stamp, stream, stream.take(waiting)))
             stream.clear()
         self._last_pair_ns = None
+        pairs = []
+        for stamp, stream, message in sorted(kept, key=lambda item: item[0]):
+            add = self.add_range if stream is self._range else self.add_color
+            pairs += add(stamp, message)
+        return pairs
 
     def flush(self) -> list[Pair]:
         """Pair what can be paired now that nothing more comes, and count the rest as dropped."""

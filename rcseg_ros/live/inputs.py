@@ -105,6 +105,7 @@ class Inputs:
         """Forget what waits for a partner, as when time jumps back."""
         self._source = self._parameters["input.range_from"]
         self._unstamped: set[str] = set()
+        self._stamped: set[str] = set()
         self._sync.let_go()
         before, self._sync = (
             self._sync,
@@ -117,13 +118,13 @@ class Inputs:
         for subscription in self._subscriptions.values():
             subscription.ask_again()
 
-    def _pair_by(self, *, stamps: bool) -> None:
-        """Pair by stamp, or by arrival; what waits under the other rule is let go."""
+    def _pair_by(self, *, stamps: bool) -> list[Pair]:
+        """Pair by stamp, or by arrival; what waits without the stamp that is needed is let go."""
         offset_ms, slop_ns = self._parameters["sync.offset_ms"], round(self._parameters["sync.slop_ms"] * 1e6)
-        self._sync.start_anew()
         self._sync.slop_ns = slop_ns if stamps else max(slop_ns, _ARRIVAL_SLOP_NS)
         self._sync.offset_ns = 0 if offset_ms == "auto" or not stamps else round(offset_ms * 1e6)
         self._hearing = Hearing()
+        return self._sync.start_anew(lambda message: (stamps and header_of(message).stamp_ns) or None)
 
     def stop(self) -> None:
         """Let messages pass unread; the subscriptions stay, so that a start is quick."""
@@ -184,7 +185,7 @@ class Inputs:
         arrived_s = time.monotonic()
         self._health.count(f"received.{topic}")
         try:
-            pairs = self._pair(topic, self._pairing_ns(topic, message), message)
+            pairs = self._take(topic, message)
         except Exception as error:
             self._on_error(error, topic)
             return
@@ -193,18 +194,25 @@ class Inputs:
         for pair in pairs:
             self._on_pair(pair, arrived_s)
 
-    def _pairing_ns(self, topic: str, message: Any) -> int:
-        """The time that pairs: the stamp, or, while one of the drivers stamps zero, the arrival of both."""
+    def _take(self, topic: str, message: Any) -> list[Pair]:
+        """Pair by the stamp, or, while one of the drivers stamps zero, by the arrival of both."""
         now_ns, stamp_ns = time.monotonic_ns(), header_of(message).stamp_ns
         if topic in _CAMERAS:
-            return stamp_ns
+            return self._pair(topic, stamp_ns, message)
+        if not stamp_ns and topic in self._stamped:  # the next one tells whether the driver has changed
+            self._stamped.discard(topic)
+            self._health.count(f"dropped.unstamped_{topic}")
+            return []
         before = bool(self._unstamped)
-        (self._unstamped.discard if stamp_ns else self._unstamped.add)(topic)
-        if bool(self._unstamped) != before:
-            self._pair_by(stamps=before)
+        if stamp_ns:
+            self._stamped.add(topic)
+            self._unstamped.discard(topic)
+        else:
+            self._unstamped.add(topic)
+        pairs = self._pair_by(stamps=before) if bool(self._unstamped) != before else []
         pairing_ns = now_ns if self._unstamped else stamp_ns
         self._hearing.heard(topic, pairing_ns, now_ns, len(getattr(message, "data", ())))
-        return pairing_ns
+        return pairs + self._pair(topic, pairing_ns, message)
 
     def _measure_offset(self) -> None:
         """With sync.offset_ms auto: where nothing pairs, take over the offset of neighbours by arrival."""

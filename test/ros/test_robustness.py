@@ -160,6 +160,41 @@ def test_stamps_of_zero_are_paired_by_arrival(live, peer, frame):
     assert live.stamp_of(peer.received["labels"][-1]) == 0
 
 
+def test_a_stamp_of_zero_among_others_costs_no_frame(live, peer, frame):
+    """One message without a stamp is refused; after some without, the first frame with stamps pairs."""
+    labels = live.expected_labels(frame)
+
+    def good():
+        stamp = next(stamps)
+        peer.publish(camera_info=live.camera_info_of(frame, stamp), points=live.cloud_of(frame, stamp))
+        return stamp
+
+    def heard(topic):
+        before = peer.count(f"received.{topic}")
+        return lambda: peer.count(f"received.{topic}") > before
+
+    def without_stamp():
+        return [live.stamp_of(message) for message in list(peer.received["labels"])].count(0)
+
+    def follow(stamp):
+        peer.publish(image=live.image_of(frame, stamp))
+        np.testing.assert_array_equal(live.image_array(peer.wait_for("labels", stamp)), labels)
+
+    follow(good())  # whatever came before, from here on there are stamps
+    stamp, refused = good(), peer.count("dropped.unstamped_image")
+    peer.publish(image=live.image_of(frame, 0))
+    live.wait_until(lambda: peer.count("dropped.unstamped_image") > refused, 10, peer.diagnostics)
+    follow(stamp)
+    before = without_stamp()
+    for _ in range(2):
+        peer.publish(points=live.cloud_of(frame, 0), image=live.image_of(frame, 0))
+    live.wait_until(lambda: without_stamp() > before, 20, peer.diagnostics)
+    points_came = heard("points")
+    stamp = good()
+    live.wait_until(points_came, 10, peer.diagnostics)  # range first
+    follow(stamp)
+
+
 def test_best_effort_publishers_are_heard(live, run):
     process, peer = run("of_driver", {}, ("labels",), reliable=False)
     process.wait_for_output("offers best effort only", 20)

@@ -244,3 +244,17 @@ def test_pairs_that_wait_for_a_camera_are_let_go_with_the_rest():
     sync.add_color(1 * MS, 1)
     sync.let_go()
     assert dropped(sync) == {"no_camera_info": 1} and sync.add_camera(0, "camera") == []
+
+
+def test_what_waits_is_taken_in_again_under_other_stamps():
+    """As when drivers begin to stamp: those without a stamp are let go, the others pair by theirs."""
+    sync = FrameSync(slop_ns=20 * MS, offset_ns=3 * MS)
+    for arrived, message in ((100, 7), (400, 9)):
+        assert sync.add_range(arrived * MS, message) == []
+    for arrived, message in ((200, 10), (700, None)):
+        assert sync.add_color(arrived * MS, message) == []
+    (pair,) = sync.start_anew(lambda stamp: stamp and stamp * MS)
+    assert (pair.stamp_ns, pair.range, pair.color) == (7 * MS, 7, 10)
+    assert dropped(sync) == {"unpaired_color": 1}
+    (pair,) = sync.add_color(12 * MS, 12)
+    assert pair.range == 9
