@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,6 +23,25 @@ def square_to(axis: Array) -> Array:
     unit[int(np.argmin(np.abs(axis)))] = 1.0
     first = cross(axis, unit)
     return np.asarray(first / np.sqrt(first @ first))
+
+
+def rotation(vector: Array) -> Array:
+    """(3, 3) the turn about a vector (3,) by its length, rad, by Rodrigues' formula."""
+    x, y, z = vector.tolist()
+    angle2 = x * x + y * y + z * z
+    angle = math.sqrt(angle2)
+    if angle < 1e-4:  # to the fourth order
+        sine, cosine = 1.0 - angle2 / 6.0, 0.5 - angle2 / 24.0
+    else:
+        sine, cosine = math.sin(angle) / angle, 2.0 * (math.sin(0.5 * angle) / angle) ** 2
+    a, b, c = cosine * x * y, cosine * y * z, cosine * z * x
+    return np.array(
+        [
+            [1.0 - cosine * (y * y + z * z), a - sine * z, c + sine * y],
+            [a + sine * z, 1.0 - cosine * (x * x + z * z), b - sine * x],
+            [c - sine * y, b + sine * x, 1.0 - cosine * (x * x + y * y)],
+        ]
+    )
 
 
 def median(values: Array) -> float:

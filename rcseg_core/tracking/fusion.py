@@ -171,7 +171,6 @@ class Filter:
         rows of 5: value, change, best
     drift : (6, 6) up to which it was carried
     levers : (q, 6) of its anchor
-    latest : the last measurement, of planes, as it was stated
     """
 
     def __init__(self, first: Local, drift: Array = NO_DRIFT) -> None:
@@ -181,7 +180,6 @@ class Filter:
         self.state[5, 2] = np.inf
         self.drift, self.levers = drift, levers(first)
         self._told: Local | None = first
-        self.latest: LocalPlane | None = None
         self.add(Related(np.zeros(self.size), first.covariance, first.systematic))
 
     def carried(self, drift: Array) -> Filter:
@@ -219,7 +217,3 @@ class Filter:
             random, systematic = self.state[3:5, :q, :q].copy()
             self._told = shifted(self.anchor, self.state[5, 1, :q], random, systematic)
         return self._told
-
-    def renew(self, state: Array, told: LocalPlane) -> None:
-        """Go on with another state, and the shape that it tells."""
-        self.state, self._told = state, told

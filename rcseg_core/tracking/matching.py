@@ -7,12 +7,14 @@ included, forbids pairs that lie over each other and are two surfaces all the sa
 from __future__ import annotations
 
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.stats import chi2
 
+from rcseg_core.compute.jit import bare
 from rcseg_core.config import TrackingConfig
 from rcseg_core.shapes.local_forms import LocalSphere
 from rcseg_core.tracking.fusion import Local, Related, relate
@@ -23,27 +25,66 @@ Array = NDArray[np.float64]
 COLOR_SIGMA = 30.0
 
 
-def assign(score: Array) -> list[tuple[int, int]]:
-    """Pairs (row, column) with the largest sum of scores; 0 forbids a pair.
+class Side(NamedTuple):
+    """Tracks or labels that compete, n of them.
+
+    size : (n,) squares: of a track those that are visible
+    color : (n, 3) levels; NaN where it is unknown
+    """
+
+    size: Array
+    color: Array
+
+
+def scores(
+    common: Array, tracks: Side, labels: Side, free: NDArray[np.bool_], config: TrackingConfig
+) -> tuple[Array, NDArray[np.bool_]]:
+    """How well tracks and labels go together by place and colour.
+
+    Parameters
+    ----------
+    common : (T, M) intersections, squares
+    free : (M,) whether the label may be taken
+
+    Returns
+    -------
+    score : (T, M) intersection over union, and a bonus for equal colour; 0 where the next is False
+    allowed : (T, M) whether they overlap enough
+    """
+    score, allowed = np.zeros(common.shape), np.zeros(common.shape, np.bool_)
+    _score(common, *tracks, *labels, free, config.min_overlap, config.color_weight, score, allowed)
+    return score, allowed
+
+
+@bare
+def _score(  # type: ignore[no-untyped-def]
+    common, visible, color, size, seen_color, free, least, color_weight, score, allowed
+):
+    for t in range(common.shape[0]):
+        for m in range(common.shape[1]):
+            both = common[t, m]
+            if not both > 0.0 or not free[m]:
+                continue
+            union = visible[t] + size[m] - both
+            share = both / union if union > 0.0 else both
+            if share < least:
+                continue
+            distance2 = 0.0
+            for c in range(3):
+                distance2 += (color[t, c] - seen_color[m, c]) ** 2
+            like = np.exp(-0.5 * distance2 / COLOR_SIGMA**2)
+            allowed[t, m] = True
+            score[t, m] = share + (color_weight * like if like == like else 0.0)  # NaN is unlike itself
+
+
+def assign(score: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows and columns of the pairs with the largest sum of scores (T, M); 0 forbids a pair.
 
     Rows are in the order of the tracks' ids and columns in that of labels, and so are equal choices.
     """
-    if not score.size:
-        return []
     rows, columns = linear_sum_assignment(score, maximize=True)
-    return [(r, c) for r, c in zip(rows.tolist(), columns.tolist(), strict=True) if score[r, c] > 0]
-
-
-def union_share(common: Array, visible: Array, size: Array) -> Array:
-    """(T, M) intersection over union, from the intersections and the sizes of both sides; 0 / 0 is 0."""
-    union = visible[:, None] + size[None] - common
-    return np.asarray(np.where(common > 0, common / np.where(union > 0, union, 1.0), 0.0))
-
-
-def likeness(first: Array, second: Array) -> Array:
-    """(n,) 1 for equal colours (n, 3) and (n, 3), falling to 0; 0 where one is unknown."""
-    distance2 = np.sum((first - second) ** 2, axis=1)
-    return np.asarray(np.nan_to_num(np.exp(-0.5 * distance2 / COLOR_SIGMA**2)), np.float64)
+    made = score[rows, columns] > 0
+    return rows[made], columns[made]
 
 
 def slack_of(config: TrackingConfig) -> tuple[float, float, float]:

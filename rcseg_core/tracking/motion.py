@@ -13,9 +13,9 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from rcseg_core.compute.jit import bare
+from rcseg_core.compute.small import rotation
 from rcseg_core.models.polynomials import Models, predict
 
 Array = NDArray[np.float64]
@@ -94,7 +94,30 @@ def _equations(xyz, every, move, seen_labels, models, lens, scale, offset, reach
             right[a] -= share * row[a] * miss
             for b in range(a + 1):
                 gram[a, b] += share * row[a] * row[b]
+    for a in range(6):
+        for b in range(a):
+            gram[b, a] = gram[a, b]
     return weight
+
+
+@bare
+def _agreeing(xyz, every, move, seen_labels, models, lens, scale, offset, reach):  # type: ignore[no-untyped-def]
+    """How many of the points of `_equations` lie within reach of a model."""
+    height, width = seen_labels.shape
+    count = 0
+    for i in range(0, xyz.shape[0], every):
+        x = move[0, 0] * xyz[i, 0] + move[0, 1] * xyz[i, 1] + move[0, 2] * xyz[i, 2] + move[0, 3]
+        y = move[1, 0] * xyz[i, 0] + move[1, 1] * xyz[i, 1] + move[1, 2] * xyz[i, 2] + move[1, 3]
+        z = move[2, 0] * xyz[i, 0] + move[2, 1] * xyz[i, 1] + move[2, 2] * xyz[i, 2] + move[2, 3]
+        if not z > 1e-6:
+            continue
+        col, row_at = x / z * lens[0] + lens[2], y / z * lens[1] + lens[3]
+        if not (-0.5 <= row_at < height - 0.5 and -0.5 <= col < width - 0.5):
+            continue
+        k = seen_labels[int(row_at + 0.5), int(col + 0.5)]
+        if k > 0 and abs((predict(models, k, row_at, col, 0, 0) * scale[0] + offset[0]) * z - 1.0) < reach:
+            count += 1
+    return count
 
 
 def estimate_motion(
@@ -127,7 +150,13 @@ def estimate_motion(
         )  # fmt: skip
         return told
 
-    start = starts[0] if len(starts) == 1 else max(starts, key=lambda s: equations(s[:3].copy(), AGREE))
+    def agreeing(start: Array) -> int:
+        count: int = _agreeing(
+            xyz, every, start[:3].copy(), seen.labels, seen.models, seen.lens, seen.scale, seen.offset, AGREE
+        )
+        return count
+
+    start = starts[0] if len(starts) == 1 else max(starts, key=agreeing)
     move = start[:3].copy()
     spread = np.repeat(sigma, 3)
     prior = np.diag(spread**-2.0)
@@ -135,16 +164,15 @@ def estimate_motion(
     told = 0.0
     for step in range(STEPS):
         told = equations(move, REACH * max(0.5**step, 0.2))
-        whole = np.tril(gram) + np.tril(gram, -1).T
         share = every / POINTS_A_MEASUREMENT if every < POINTS_A_MEASUREMENT else 1.0
-        change = np.linalg.solve(share * whole + prior, share * right - prior @ gone)
-        turn = Rotation.from_rotvec(change[3:]).as_matrix()
+        change = np.asarray(np.linalg.solve(share * gram + prior, share * right - prior @ gone), np.float64)
+        turn = rotation(change[3:])
         move[:, :3] = turn @ move[:, :3]
         move[:, 3] = turn @ move[:, 3] + change[:3]
         gone += change
         if np.abs(change / spread).max() < 1e-3:
             break
-    covariance: Array = np.linalg.inv(share * whole + prior)
+    covariance = np.asarray(np.linalg.inv(share * gram + prior), np.float64)
     left = covariance / np.outer(spread, spread)
     held = told > 0 and float(np.linalg.eigvalsh(left)[-1]) < HELD**2
     motion = np.eye(4)

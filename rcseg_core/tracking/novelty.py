@@ -8,13 +8,8 @@ that is the share of the error that averages away. The rest is systematic.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import NDArray
-
-from rcseg_core.shapes.plane_forms import LocalPlane
-from rcseg_core.tracking.planes import Planes, misses
 
 Array = NDArray[np.float64]
 #: Measurements for which it is held that all is new, before any tell; chi-squared by degree of freedom beyond
@@ -37,16 +32,13 @@ class Novelty:
     def share(self) -> float:
         return min(self._total / self._count, 1.0)
 
-    def add(self, before: Sequence[LocalPlane], now: Planes, more: Array) -> None:
-        """Take in two measurements of some planes.
+    def add(self, far: Array) -> None:
+        """Take in two measurements of each of some planes.
 
         Parameters
         ----------
-        before : (n,) as one frame showed them, in the fixed frame
-        now : as another does
-        more : (n, 3) variances beside those of their own errors, for both together
+        far : (n,) squared differences, see `planes.misses`; NaN tells nothing
         """
-        if len(before):
-            far = misses(Planes.of(before), now, more) / 3.0
-            self._total += float(np.minimum(far, CAP).sum())
-            self._count += len(before)
+        told = far[~np.isnan(far)] / 3.0
+        self._total += float(np.minimum(told, CAP).sum())
+        self._count += len(told)

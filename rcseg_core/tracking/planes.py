@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from rcseg_core.compute.jit import bare
 from rcseg_core.shapes.plane_forms import LocalPlane
-from rcseg_core.tracking.fusion import LEAST_COSINE, Filter, Local
+from rcseg_core.tracking.fusion import LEAST_COSINE, Local
 from rcseg_core.tracking.kernels import MOST, SCRATCH, add_frame, add_spread, chi_squared, relate_planes
 
 Array = NDArray[np.float64]
@@ -30,11 +30,12 @@ class Planes(NamedTuple):
 
     def spread(self, sensor: Array, shift2: float, pose_turn2: float, turn2: float) -> Array:
         """(m, 3) as `matching.spread_by_pose` of each."""
-        off = self.pose[:, :3, 3] - sensor
-        along = np.einsum("ij,ij->i", off, self.pose[:, :3, 2])
-        lever2 = np.maximum(np.einsum("ij,ij->i", off, off) - along**2, 0.0)
-        more = np.full((len(off), 3), turn2)
-        more[:, 2] = shift2 + pose_turn2 * lever2
+        more = np.full((len(self.pose), 3), turn2)
+        more[:, 2] = shift2
+        if pose_turn2 > 0.0:  # else wherever the sensor is
+            off = self.pose[:, :3, 3] - sensor
+            along = np.einsum("ij,ij->i", off, self.pose[:, :3, 2])
+            more[:, 2] += pose_turn2 * np.maximum(np.einsum("ij,ij->i", off, off) - along**2, 0.0)
         return more
 
     def some(self, rows: list[int]) -> Planes:
@@ -50,47 +51,110 @@ class Planes(NamedTuple):
     @classmethod
     def of(cls, forms: Sequence[Local | None]) -> Planes:
         """Those of a list of shapes."""
-        flat = [form for form in forms if isinstance(form, LocalPlane)]
+        at = [i for i, form in enumerate(forms) if isinstance(form, LocalPlane)]
+        flat: list[LocalPlane] = [forms[i] for i in at]  # type: ignore[misc]
         row = np.full(len(forms), -1)
-        row[[isinstance(form, LocalPlane) for form in forms]] = np.arange(len(flat))
+        row[at] = np.arange(len(at))
         return cls(
             row,
-            np.array([form.pose for form in flat]).reshape(-1, 4, 4),
-            np.array([form.covariance for form in flat]).reshape(-1, 3, 3),
-            np.array([form.systematic for form in flat]).reshape(-1, 3, 3),
+            _stacked([form.pose for form in flat], 4),
+            _stacked([form.covariance for form in flat], 3),
+            _stacked([form.systematic for form in flat], 3),
         )
 
 
-def forbid(allowed: NDArray[np.bool_], tracks: Planes, labels: Planes, more: Array, limit: float) -> None:
+def _stacked(matrices: list[Array], size: int) -> Array:
+    """(m, size, size) of m matrices."""
+    return np.concatenate(matrices).reshape(-1, size, size) if matrices else np.empty((0, size, size))
+
+
+class FusedPlanes(NamedTuple):
+    """What `fusion.Filter` knows of planes, a row for each of n tracks; changed in place.
+
+    known : (n,) bool, whether the track is a plane; where not, the rest tells nothing
+    anchor : (n, 4, 4) pose of the first measurement
+    pose : (n, 4, 4) of the mean
+    state : (n, 6, 5, 5) as `Filter.state`
+    levers : (n, 3, 6) as `Filter.levers`
+    latest_pose, latest_random : (n, 4, 4) and (n, 3, 3), the last measurement as it was stated
+    """
+
+    known: NDArray[np.bool_]
+    anchor: Array
+    pose: Array
+    state: Array
+    levers: Array
+    latest_pose: Array
+    latest_random: Array
+
+    @classmethod
+    def none(cls, count: int) -> FusedPlanes:
+        """Rows that are no planes."""
+        return cls(
+            np.zeros(count, np.bool_), np.zeros((count, 4, 4)), np.zeros((count, 4, 4)),
+            np.zeros((count, 6, MOST, MOST)), np.zeros((count, 3, 6)), np.zeros((count, 4, 4)),
+            np.zeros((count, 3, 3)),
+        )  # fmt: skip
+
+    def fused(self, pose: Array | None = None) -> list[LocalPlane | None]:
+        """The means, None where there is none; `pose` (4, 4) takes them to another frame."""
+        poses = self.pose.copy() if pose is None else np.matmul(pose, self.pose)
+        random, systematic = self.state[:, 3, :3, :3].copy(), self.state[:, 4, :3, :3].copy()
+        return [
+            LocalPlane(poses[i], random[i], systematic[i]) if known else None
+            for i, known in enumerate(self.known.tolist())
+        ]
+
+    def carry(self, more: Array) -> None:
+        """`Filter.carried` of all by the error of a motion (6, 6), see `fusion.in_fixed_frame`."""
+        spread = self.levers @ more @ self.levers.transpose(0, 2, 1)
+        _carry(self.known, self.state, spread, np.empty((SCRATCH, MOST + 1, MOST)))
+
+
+@bare
+def _carry(known, state, more, scratch):  # type: ignore[no-untyped-def]
+    for i in range(state.shape[0]):
+        if known[i]:
+            mine = state[i]
+            add_spread(more[i], 3, mine[5, 2], mine[:3], mine[5, 0], mine[5, 1], mine[3:5], scratch)
+
+
+def forbid(
+    allowed: NDArray[np.bool_], rows: NDArray[np.int64], tracks: FusedPlanes, labels: Planes, more: Array,
+    limit: float,
+) -> None:  # fmt: skip
     """Forbid pairs of planes that differ by more than chance.
 
     Parameters
     ----------
     allowed : (T, M) is changed
-    tracks, labels : the planes among T and M shapes
+    rows : (T,) of the tracks
+    labels : the planes among M shapes
     more : (m, 3) variances beside those of both errors, for each plane of `labels`
     limit : chi-squared
     """
     _forbid(
-        allowed, *tracks, *labels, more, LEAST_COSINE, limit, np.empty(3), np.empty((4, 3, 3)),
-        np.empty((SCRATCH, MOST + 1, MOST)),
+        allowed, rows, tracks.known, tracks.pose, tracks.state, *labels, more, LEAST_COSINE, limit,
+        np.empty(3), np.empty((4, 3, 3)), np.empty((SCRATCH, MOST + 1, MOST)),
     )  # fmt: skip
 
 
 @bare
 def _forbid(  # type: ignore[no-untyped-def]
-    allowed, known, known_pose, known_random, known_systematic, found, pose, random, systematic, more,
-    least_cosine, limit, difference, room, scratch,
+    allowed, rows, known, known_pose, state, found, pose, random, systematic, more, least_cosine, limit,
+    difference, room, scratch,
 ):  # fmt: skip
     for t in range(allowed.shape[0]):
-        i = known[t]
+        i = rows[t]
+        if not known[i]:
+            continue
         for m in range(allowed.shape[1]):
             j = found[m]
-            if not allowed[t, m] or i < 0 or j < 0:
+            if not allowed[t, m] or j < 0:
                 continue
             far = _miss(
-                known_pose[i], known_random[i], known_systematic[i], pose[j], random[j], systematic[j],
-                more[j], least_cosine, difference, room, scratch,
+                known_pose[i], state[i, 3], state[i, 4], pose[j], random[j], systematic[j], more[j],
+                least_cosine, difference, room, scratch,
             )  # fmt: skip
             allowed[t, m] = far <= limit
 
@@ -112,114 +176,116 @@ def _miss(  # type: ignore[no-untyped-def]
     return chi_squared(difference, room[2], 3, scratch[0])
 
 
-def misses(first: Planes, second: Planes, more: Array) -> Array:
-    """(m,) chi-squared of the differences of planes, one by one, by the random parts of both and `more`
-    (m, 3); inf where their normals are far apart."""
-    out = np.empty(len(first.pose))
+def misses(rows: NDArray[np.int64], tracks: FusedPlanes, now: Planes, more: Array) -> Array:
+    """(n,) chi-squared of the differences of the last measurements of some tracks from as many of now.
+
+    By the random parts of both and `more` (n, 3); inf where their normals are far apart, NaN where a track
+    was no plane.
+    """
+    out = np.full(len(rows), np.nan)
     _misses(
-        *first[1:3], *second[1:3], more, LEAST_COSINE, out, np.empty(3), np.empty((5, 3, 3)),
-        np.empty((SCRATCH, MOST + 1, MOST)),
+        rows, tracks.known, tracks.latest_pose, tracks.latest_random, now.pose, now.random, more,
+        LEAST_COSINE, out, np.empty(3), np.empty((5, 3, 3)), np.empty((SCRATCH, MOST + 1, MOST)),
     )  # fmt: skip
     return out
 
 
 @bare
 def _misses(  # type: ignore[no-untyped-def]
-    known_pose, known_random, pose, random, more, least_cosine, out, difference, room, scratch
+    rows, known, known_pose, known_random, pose, random, more, least_cosine, out, difference, room, scratch
 ):
     none = room[4]
     none[:, :] = 0.0
-    for i in range(out.shape[0]):
-        out[i] = _miss(
-            known_pose[i], known_random[i], none, pose[i], random[i], none, more[i], least_cosine, difference,
-            room, scratch,
-        )  # fmt: skip
+    for j in range(rows.shape[0]):
+        i = rows[j]
+        if known[i]:
+            out[j] = _miss(
+                known_pose[i], known_random[i], none, pose[j], random[j], none, more[j], least_cosine,
+                difference, room, scratch,
+            )  # fmt: skip
 
 
-def carry_planes(filters: Sequence[Filter], drift: Array) -> None:
-    """`Filter.carried` of filters that are all of planes."""
-    old = [one for one in filters if one.drift is not drift]
-    if not old:
-        return
-    state, table = np.array([one.state for one in old]), np.array([one.levers for one in old])
-    more = table @ (drift - np.array([one.drift for one in old])) @ table.transpose(0, 2, 1)
-    told = np.zeros(len(old), np.bool_)
-    _carry(state, more, told, np.empty((SCRATCH, MOST + 1, MOST)))
-    for one, mine, renewed in zip(old, state, told.tolist(), strict=True):
-        one.drift = drift
-        if renewed:
-            one.renew(mine.copy(), LocalPlane(one.fused.pose, mine[3, :3, :3].copy(), one.fused.systematic))  # type: ignore[union-attr]
-
-
-@bare
-def _carry(state, more, told, scratch):  # type: ignore[no-untyped-def]
-    for i in range(state.shape[0]):
-        mine = state[i]
-        told[i] = add_spread(more[i], 3, mine[5, 2], mine[:3], mine[5, 0], mine[5, 1], mine[3:5], scratch)
-
-
-def fuse(filters: Sequence[Filter], seen: Planes, more: Array, limit: float) -> NDArray[np.bool_]:
-    """Take one measurement into each filter, all of planes.
+def fuse(
+    rows: NDArray[np.int64], tracks: FusedPlanes, seen: Planes, more: Array, limit: float
+) -> NDArray[np.bool_]:
+    """Take one measurement into each of some tracks; those that have moved, or were none, begin anew.
 
     Parameters
     ----------
+    rows : (n,) of the tracks, each once
     seen : as many planes
     more : (n, 3) variances beside those of their own errors
     limit : chi-squared beyond which a plane has moved
 
     Returns
     -------
-    (n,) whether the plane is still the same; where it has moved the filter is left as it was
+    (n,) whether the plane is still the same
     """
-    same = np.zeros(len(filters), np.bool_)
-    if filters:
-        state = np.array([one.state for one in filters])
-        anchor, pose = (
-            Planes.of([one.anchor for one in filters]).pose,
-            Planes.of([one.fused for one in filters]).pose,
-        )
-        told = np.zeros(len(filters), np.bool_)
-        _fuse(
-            state, anchor, pose, seen.pose, seen.random, seen.systematic, more, LEAST_COSINE, limit, same,
-            told, np.empty(3), np.empty((4, 3, 3)), np.empty(MOST), np.empty((2, MOST, MOST)),
-            np.empty((SCRATCH, MOST + 1, MOST)),
-        )  # fmt: skip
-        for i in np.flatnonzero(told).tolist():
-            mine = state[i].copy()
-            filters[i].renew(mine, LocalPlane(pose[i].copy(), mine[3, :3, :3].copy(), mine[4, :3, :3].copy()))
+    same = np.zeros(len(rows), np.bool_)
+    _fuse(
+        rows, tracks.known, tracks.anchor, tracks.pose, tracks.state, tracks.levers, seen.pose, seen.random,
+        seen.systematic, more, LEAST_COSINE, limit, same, np.empty(3), np.empty((4, 3, 3)), np.empty(MOST),
+        np.empty((2, MOST, MOST)), np.empty((SCRATCH, MOST + 1, MOST)),
+    )  # fmt: skip
     return same
 
 
 @bare
 def _fuse(  # type: ignore[no-untyped-def]
-    state, anchor, fused_pose, pose, random, systematic, more, least_cosine, limit, same, told, difference,
-    room, change, fused, scratch,
+    rows, known, anchor, fused_pose, state, levers, pose, random, systematic, more, least_cosine, limit, same,
+    difference, room, change, fused, scratch,
 ):  # fmt: skip
-    for i in range(state.shape[0]):
+    for j in range(rows.shape[0]):
+        i = rows[j]
         mine = state[i]
-        far = _miss(
-            fused_pose[i], mine[3, :3, :3], mine[4, :3, :3], pose[i], random[i], systematic[i], more[i],
-            least_cosine, difference, room, scratch,
-        )  # fmt: skip
-        if not far <= limit:
-            continue
-        if not relate_planes(
-            anchor[i], pose[i], random[i], systematic[i], least_cosine, difference, room[0], room[1], scratch
-        ):
-            continue
-        same[i] = True
+        if known[i]:
+            far = _miss(
+                fused_pose[i], mine[3], mine[4], pose[j], random[j], systematic[j], more[j], least_cosine,
+                difference, room, scratch,
+            )  # fmt: skip
+            same[j] = far <= limit and relate_planes(
+                anchor[i], pose[j], random[j], systematic[j], least_cosine, difference, room[0], room[1],
+                scratch,
+            )  # fmt: skip
+        if not same[j]:
+            known[i] = True
+            _begin(pose[j], random[j], systematic[j], more[j], anchor[i], fused_pose[i], mine, levers[i])
+            for a in range(3):
+                difference[a] = 0.0
+                for b in range(3):
+                    room[0, a, b], room[1, a, b] = random[j, a, b], systematic[j, a, b]
         for a in range(3):
-            room[0, a, a] += more[i, a]
+            room[0, a, a] += more[j, a]
         if add_frame(
             difference, room[0], room[1], 3, mine[5, 2], mine[:3], mine[5, 0], change, fused, scratch
         ):
-            told[i] = True
             for a in range(3):
                 mine[5, 1, a] = change[a]
                 for b in range(3):
                     mine[3, a, b] = fused[0, a, b]
                     mine[4, a, b] = fused[1, a, b]
             _shift(anchor[i], change, fused_pose[i])
+
+
+@bare
+def _begin(pose, random, systematic, more, anchor, fused_pose, state, levers):  # type: ignore[no-untyped-def]
+    """The row of a plane before its first measurement counts, see `fusion.Filter` and `fusion.levers`."""
+    for a in range(4):
+        for b in range(4):
+            anchor[a, b] = fused_pose[a, b] = pose[a, b]
+    state[:, :, :] = 0.0
+    state[5, 2, 0] = np.inf
+    levers[:, :] = 0.0
+    for a in range(3):
+        for b in range(3):
+            state[3, a, b] = random[a, b]
+            state[4, a, b] = systematic[a, b]
+        state[3, a, a] += more[a]
+        b, c = (a + 1) % 3, (a + 2) % 3
+        levers[0, 3 + a] = pose[a, 0]
+        levers[1, 3 + a] = pose[a, 1]
+        levers[2, a] = pose[a, 2]
+        levers[2, 3 + a] = pose[b, 3] * pose[c, 2] - pose[c, 3] * pose[b, 2]
 
 
 @bare

@@ -19,142 +19,152 @@ from rcseg_core.tracking.observation import Observation
 Array = NDArray[np.float64]
 #: Rows and columns at which a point votes, in margins: itself, and the four around it.
 AROUND = np.array([[0, 0], [-1, 0], [0, 1], [1, 0], [0, -1]], np.int64)
-#: Votes that are for no label.
-GONE, HIDDEN = -1, 0
 
 
 @bare
-def _project(xyz, pixel, lens, height, width, at):  # type: ignore[no-untyped-def]
-    """at (n, 2): row, column of each point, -1 outside; without a camera the pixel that it was seen at."""
+def _project(xyz, pixel, into, lens, height, width, depth, at):  # type: ignore[no-untyped-def]
+    """depth (n,) and at (n, 2), row and column, of each point in the new view; row -1 outside. Without a
+    camera the pixel that it was seen at."""
     for i in range(xyz.shape[0]):
         at[i, 0] = -1
+        x, y, z = xyz[i, 0], xyz[i, 1], xyz[i, 2]
+        depth[i] = into[2, 0] * x + into[2, 1] * y + into[2, 2] * z + into[2, 3]
         row, col = np.float64(pixel[i, 0]), np.float64(pixel[i, 1])
         if lens[0] > 0.0:
-            if not xyz[i, 2] > 1e-6:
+            if not depth[i] > 1e-6:
                 continue
-            col = xyz[i, 0] / xyz[i, 2] * lens[0] + lens[2]
-            row = xyz[i, 1] / xyz[i, 2] * lens[1] + lens[3]
+            right = into[0, 0] * x + into[0, 1] * y + into[0, 2] * z + into[0, 3]
+            down = into[1, 0] * x + into[1, 1] * y + into[1, 2] * z + into[1, 3]
+            col = right / depth[i] * lens[0] + lens[2]
+            row = down / depth[i] * lens[1] + lens[3]
         if -0.5 <= row < height - 0.5 and -0.5 <= col < width - 0.5:
             at[i, 0] = int(row + 0.5)
             at[i, 1] = int(col + 0.5)
 
 
 @bare
-def _nearest(xyz, at, step, buffer):  # type: ignore[no-untyped-def]
+def _nearest(depth, at, step, buffer):  # type: ignore[no-untyped-def]
     """buffer: least depth of the points in each square of the view."""
     buffer[:] = np.inf
-    for i in range(xyz.shape[0]):
+    for i in range(depth.shape[0]):
         if at[i, 0] >= 0:
             row, col = at[i, 0] // step, at[i, 1] // step
-            buffer[row, col] = min(buffer[row, col], xyz[i, 2])
+            buffer[row, col] = min(buffer[row, col], depth[i])
 
 
 @bare
-def _vote(xyz, at, labels, models, lens, scale, offset, step, buffer, around, margin, tolerance, out):  # type: ignore[no-untyped-def]
-    """See `carry`; buffer of one square: no point hides another."""
+def _vote(  # type: ignore[no-untyped-def]
+    weight, row, depth, at, labels, models, lens, scale, offset, step, buffer, around, margin, tolerance,
+    common, visible,
+):  # fmt: skip
+    """See `carry`; buffer of one square: no point hides another. Adds to common and visible."""
     height, width = labels.shape
     hides = buffer.shape[0] > 1
-    for i in range(xyz.shape[0]):
-        for v in range(around.shape[0]):
-            out[i, v] = 0
+    for i in range(depth.shape[0]):
         if at[i, 0] < 0:
             continue
-        if hides and xyz[i, 2] > buffer[at[i, 0] // step, at[i, 1] // step] * (1.0 + tolerance):
+        if hides and depth[i] > buffer[at[i, 0] // step, at[i, 1] // step] * (1.0 + tolerance):
             continue
+        share, told = weight[i] / around.shape[0], 0
         for v in range(around.shape[0]):
-            row = at[i, 0] + margin * around[v, 0]
-            col = at[i, 1] + margin * around[v, 1]
-            if row < 0 or row >= height or col < 0 or col >= width:
+            r = at[i, 0] + margin * around[v, 0]
+            c = at[i, 1] + margin * around[v, 1]
+            if r < 0 or r >= height or c < 0 or c >= width:
                 continue
-            k = labels[row, col]
+            k = labels[r, c]
             if k <= 0:
                 continue
-            if lens[0] == 0.0:
-                out[i, v] = k
-                continue
-            seen = (predict(models, k, row, col, 0, 0) * scale[0] + offset[0]) * xyz[i, 2]  # over 1: nearer
-            if seen > 1.0 + tolerance:
-                out[i, v] = 0
-            elif seen < 1.0 - tolerance:
-                out[i, v] = -1
+            if lens[0] > 0.0:
+                seen = (predict(models, k, r, c, 0, 0) * scale[0] + offset[0]) * depth[i]  # over 1: nearer
+                if seen > 1.0 + tolerance:
+                    continue
+                told += 1
+                if seen < 1.0 - tolerance:
+                    continue
             else:
-                out[i, v] = k
-
-
-def carry(
-    xyz: Array, pixel: NDArray[np.int64], seen: Observation, step: int, tolerance: float, margin: int = 0,
-    hides: bool = True,
-) -> NDArray[np.int64]:  # fmt: skip
-    """The regions that points vote for in the new view.
-
-    Parameters
-    ----------
-    xyz : (n, 3) float64, m, in the new sensor frame
-    pixel : (n, 2) where they were seen, which is where they are without a camera
-    step : side of the squares in which the nearest point hides the others, px
-    tolerance : by which depths may differ, fraction of depth
-    margin : px between the places at which a point votes; 0: at its own alone
-    hides : whether points hide each other
-
-    Returns
-    -------
-    (n, v) int64, for each point and place the region that it falls on and agrees with; HIDDEN where it tells
-    nothing (out of the image, behind something, unlabelled); GONE where something farther is seen
-    """
-    height, width = seen.labels.shape
-    at = np.empty((len(xyz), 2), np.int64)
-    _project(xyz, pixel, seen.lens, height, width, at)
-    size = (height // step + 1, width // step + 1) if hides else (1, 1)
-    buffer = np.empty(size)
-    if hides:
-        _nearest(xyz, at, step, buffer)
-    around = AROUND if margin else AROUND[:1]
-    out = np.empty((len(xyz), len(around)), np.int64)
-    _vote(
-        xyz, at, seen.labels, seen.models, seen.lens, seen.scale, seen.offset, step, buffer, around, margin,
-        tolerance, out,
-    )  # fmt: skip
-    return out
+                told += 1
+            common[row[i], k] += share
+        visible[row[i]] += told * share
 
 
 class Overlap(NamedTuple):
-    """How the tracks of one kind lie over its labels, in squares.
+    """How what was there lies over labels, in squares.
 
-    common : (T + 1, M + 1) float64, votes of track row t for label m; row and column 0 are of no meaning
+    common : (T + 1, M + 1) float64, votes of row t for label m; row and column 0 are of no meaning
     visible : (T + 1,) all votes of t that tell something
     """
 
     common: Array
     visible: Array
 
+    def of_groups(
+        self, row: NDArray[np.int64], rows: int, group: NDArray[np.int64], count: int
+    ) -> Overlap:  # fmt: skip
+        """The same of groups of rows and of labels.
 
-def overlap(
-    votes: NDArray[np.int64], weight: Array, row: NDArray[np.int64], rows: int, group: NDArray[np.int64],
-    count: int,
-) -> Overlap:  # fmt: skip
-    """Sum the votes of points for one kind.
-
-    Parameters
-    ----------
-    votes : (n, v) as `carry` gives them
-    weight, row : (n,) of each point, and the row of its track, 1..rows
-    group : (N + 1,) label of this kind by region
-    count : labels of this kind
-    """
-    over = Overlap(np.zeros((rows + 1, count + 1)), np.zeros(rows + 1))
-    _count(votes, weight, row, group, *over)
-    return over
+        Parameters
+        ----------
+        row : (T + 1,) the group of each row, 1..rows
+        group : (M + 1,) the group of each label, 1..count
+        """
+        over = Overlap(np.zeros((rows + 1, count + 1)), np.zeros(rows + 1))
+        _sum(*self, row, group, *over)
+        return over
 
 
 @bare
-def _count(votes, weight, row, group, common, visible):  # type: ignore[no-untyped-def]
-    """See `overlap`; adds to common and visible."""
-    places = votes.shape[1]
-    for i in range(votes.shape[0]):
-        share = weight[i] / places
-        for v in range(places):
-            label = votes[i, v]
-            if label != HIDDEN:
-                visible[row[i]] += share
-            if label > 0:
-                common[row[i], group[label]] += share
+def _sum(common, visible, row, group, out, out_visible):  # type: ignore[no-untyped-def]
+    """See `Overlap.of_groups`; adds to out."""
+    for t in range(common.shape[0]):
+        out_visible[row[t]] += visible[t]
+        for m in range(common.shape[1]):
+            if common[t, m] > 0.0:
+                out[row[t], group[m]] += common[t, m]
+
+
+class Carried(NamedTuple):
+    """Points that are looked up in a new view.
+
+    xyz : (n, 3) float64, m
+    pixel : (n, 2) int64 where they were seen, which is where they are without a camera
+    weight, row : (n,) of each point, and what it belongs to, 1..rows
+    """
+
+    xyz: Array
+    pixel: NDArray[np.int64]
+    weight: Array
+    row: NDArray[np.int64]
+    rows: int
+
+
+def carry(
+    points: Carried, into: Array, seen: Observation, step: int, tolerance: float, margin: int = 0,
+    hides: bool = True,
+) -> Overlap:  # fmt: skip
+    """What points belong to over the regions that they fall on in the new view, and agree with.
+
+    A point tells nothing where it is out of the image, behind something, or where nothing is labelled; it is
+    for no region where something farther is seen.
+
+    Parameters
+    ----------
+    into : (4, 4) takes the points into the new sensor frame
+    step : side of the squares in which the nearest point hides the others, px
+    tolerance : by which depths may differ, fraction of depth
+    margin : px between the places at which a point votes; 0: at its own alone
+    hides : whether points hide each other
+    """
+    height, width = seen.labels.shape
+    n, count = len(points.xyz), seen.count("region")
+    depth, at = np.empty(n), np.empty((n, 2), np.int64)
+    _project(points.xyz, points.pixel, into, seen.lens, height, width, depth, at)
+    size = (height // step + 1, width // step + 1) if hides else (1, 1)
+    buffer = np.empty(size)
+    if hides:
+        _nearest(depth, at, step, buffer)
+    over = Overlap(np.zeros((points.rows + 1, count + 1)), np.zeros(points.rows + 1))
+    _vote(
+        points.weight, points.row, depth, at, seen.labels, seen.models, seen.lens, seen.scale, seen.offset,
+        step, buffer, AROUND if margin else AROUND[:1], margin, tolerance, *over,
+    )  # fmt: skip
+    return over

@@ -7,27 +7,31 @@ not known. Labels that nobody takes begin tracks.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from operator import attrgetter
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rcseg_core.config import TrackingConfig
 from rcseg_core.tracking import matching
-from rcseg_core.tracking.fusion import NO_DRIFT, Filter, Local, in_fixed_frame
-from rcseg_core.tracking.named_shapes import Shapes, fixed_shapes, fuse_all, gate
+from rcseg_core.tracking.columns import longer, some
+from rcseg_core.tracking.fusion import NO_DRIFT, in_fixed_frame
+from rcseg_core.tracking.named_shapes import FusedShapes, Shapes, fixed_shapes
 from rcseg_core.tracking.novelty import Novelty
-from rcseg_core.tracking.observation import Observation, pick
-from rcseg_core.tracking.prediction import Overlap, carry, overlap
-from rcseg_core.tracking.tracks import KINDS, Track
+from rcseg_core.tracking.observation import Observation
+from rcseg_core.tracking.prediction import Carried, Overlap, carry
+from rcseg_core.tracking.tracks import KINDS, STATES, Track
 
 Array = NDArray[np.float64]
+Whole = NDArray[np.int64]
 #: Share of a new label that comes from one track, or of a lost one that lies in one label: split and union.
 LINEAGE = 0.5
 #: Points that are kept of a track, for the time when it is lost; frames after which they are renewed.
 SAMPLE, RENEW = 48, 10
+#: The kind of labels that have shapes; states by number.
+SHAPED = "surface"
+_, CONFIRMED, LOST = range(len(STATES))
 
 
 class Frame(NamedTuple):
@@ -45,27 +49,42 @@ class Frame(NamedTuple):
     posed: bool = False
 
 
-@dataclass(eq=False)
-class Entry:
-    """A track as the registry keeps it; see `tracks.Track`. Points are in the fixed frame."""
+class Entries(NamedTuple):
+    """The tracks of one kind, a row each, in the order of their ids; changed in place. See `tracks.Track`.
 
-    id: int
-    kind: str
-    first_seen_ns: int
-    first_frame: int
-    parent: int
-    state: str = "tentative"
-    label: int = 0
-    seen: int = 0
-    last_seen_ns: int = 0
-    last_frame: int = 0
-    merged_into: int = 0
-    color: Array = field(default_factory=lambda: np.full(3, np.nan))
-    filter: Filter | None = None
-    points: Array = field(default_factory=lambda: np.empty((0, 3)))
-    pixels: NDArray[np.int64] = field(default_factory=lambda: np.empty((0, 2), np.int64))
-    squares: float = 0.0
-    sampled: int = -RENEW
+    state : number of STATES
+    color : (n, 3) levels
+    points, pixels, sample : (n, SAMPLE, 3) in the fixed frame, (n, SAMPLE, 2), and how many of each there are
+    squares, sampled : at the frame of that number, when they were taken
+    """
+
+    id: Whole
+    first_seen_ns: Whole
+    first_frame: Whole
+    parent: Whole
+    state: Whole
+    label: Whole
+    seen: Whole
+    last_seen_ns: Whole
+    last_frame: Whole
+    merged_into: Whole
+    color: Array
+    points: Array
+    pixels: Whole
+    sample: Whole
+    squares: Array
+    sampled: Whole
+
+    @classmethod
+    def new(cls, ids: Whole, parent: Whole, stamp_ns: int, frame: int) -> Entries:
+        """Tracks that begin in this frame."""
+        n = len(ids)
+        zero = np.zeros((10, n), np.int64)
+        return cls(
+            ids, zero[0] + stamp_ns, zero[1] + frame, parent, zero[2], zero[3], zero[4], zero[5], zero[6],
+            zero[7], np.full((n, 3), np.nan), np.zeros((n, SAMPLE, 3)), np.zeros((n, SAMPLE, 2), np.int64),
+            zero[8], np.zeros(n), zero[9] + frame - RENEW,
+        )  # fmt: skip
 
 
 class Registry:
@@ -76,9 +95,11 @@ class Registry:
         self._frame = 0
         self._next = 1
         self._forgotten: list[int] = []
-        self._entries: dict[str, dict[int, Entry]] = {kind: {} for kind in KINDS}
+        self._entries: dict[str, Entries] = {}
+        self._fused = FusedShapes()
         self._drift = NO_DRIFT
         self._novelty = Novelty()
+        self.clear()
 
     def reconfigure(self, config: TrackingConfig) -> None:
         """End all tracks, and go on with other parameters."""
@@ -87,14 +108,16 @@ class Registry:
 
     def clear(self) -> None:
         """End all tracks; ids go on."""
-        for entries in self._entries.values():
-            self._forgotten.extend(entries)
-            entries.clear()
+        for kind in list(self._entries):
+            self._keep(kind, np.zeros(len(self._entries[kind].id), np.bool_))
+        none = np.zeros(0, np.int64)
+        self._entries = {kind: Entries.new(none, none, 0, 0) for kind in KINDS}
 
     def drift(self, pose: Array, covariance: Array) -> None:
         """The sensor came to `pose` by a motion with this error, of its own axes: what was seen before lies
         so much less certainly in the fixed frame."""
         self._drift = self._drift + in_fixed_frame(pose, covariance)
+        self._fused.carry(self._drift)
 
     def forgotten(self) -> tuple[int, ...]:
         """Ids of the tracks that ended since the last call."""
@@ -102,204 +125,191 @@ class Registry:
         return ids
 
     def update(
-        self, frame: Frame, last: Observation | None, votes: NDArray[np.int64] | None
+        self, frame: Frame, last: Observation | None, over: Overlap | None
     ) -> dict[str, NDArray[np.int32]]:
         """Ids by label for each kind.
 
         Parameters
         ----------
-        last, votes : the observation of the last frame and what `prediction.carry` made of its points; None
+        last, over : the observation of the last frame, and how its regions lie over those of this one; None
             for the first frame
         """
         self._frame += 1
-        squares = {kind: _squares(frame.seen, kind) for kind in KINDS}
         ids = {}
         for kind in KINDS:
-            ids[kind] = self._update_kind(kind, frame, last, votes, squares[kind])
+            ids[kind] = self._update_kind(kind, frame, last, over)
             self._prune(kind, frame.stamp_ns)
         return ids
 
-    def snapshot(self, place: Callable[[Local], Local] | None) -> tuple[Track, ...]:
-        """All tracks, by id; `place` takes fused shapes to the frame they are told in."""
-        entries = [entry for kind in KINDS for entry in self._entries[kind].values()]
-        entries.sort(key=lambda entry: entry.id)
-        return tuple(self._told(entry, place) for entry in entries)
-
-    def _told(self, entry: Entry, place: Callable[[Local], Local] | None) -> Track:
-        fused = None if entry.filter is None else entry.filter.carried(self._drift).fused
-        if fused is not None and place is not None:
-            fused = place(fused)
-        age = self._frame - entry.first_frame + 1
-        return Track(
-            entry.id, entry.kind, entry.state, entry.label, age, entry.seen, entry.first_seen_ns,
-            entry.last_seen_ns, entry.parent, entry.merged_into, fused,
-        )  # fmt: skip
+    def snapshot(self, home: Array | None) -> tuple[Track, ...]:
+        """All tracks, by id; `home` (4, 4) takes fused shapes to the frame they are told in."""
+        told: list[Track] = []
+        for kind, rows in self._entries.items():
+            ids = rows.id.tolist()
+            fused = self._fused.told(ids, home) if kind == SHAPED else [None] * len(ids)
+            age = self._frame - rows.first_frame + 1
+            columns = (
+                rows.label, age, rows.seen, rows.first_seen_ns, rows.last_seen_ns, rows.parent,
+                rows.merged_into,
+            )  # fmt: skip
+            states = [STATES[state] for state in rows.state.tolist()]
+            numbers = [column.tolist() for column in columns]
+            told += map(Track.of, ids, [kind] * len(ids), states, *numbers, fused)
+        return tuple(sorted(told, key=attrgetter("id")))
 
     def _update_kind(
-        self, kind: str, frame: Frame, last: Observation | None, votes: NDArray[np.int64] | None,
-        squares: Array,
-    ) -> NDArray[np.int32]:  # fmt: skip
-        entries = self._entries[kind]
-        count = frame.seen.count(kind)
-        owner: list[Entry | None] = [None] * (count + 1)
-        shapes = fixed_shapes(frame.seen.shapes, frame.pose) if kind == "surface" else Shapes([], None)
-        live = [entry for entry in entries.values() if entry.label]
-        live.sort(key=lambda entry: entry.id)
+        self, kind: str, frame: Frame, last: Observation | None, regions: Overlap | None
+    ) -> NDArray[np.int32]:
+        """Ids by label of one kind; regions: how those of the last frame lie over those of this one."""
+        rows, count = self._entries[kind], frame.seen.count(kind)
+        squares = frame.seen.squares_of(kind)
+        owner = np.full(count + 1, -1)  # row of the track of each label
+        shapes = fixed_shapes(frame.seen.shapes, frame.pose) if kind == SHAPED else None
+        live = np.flatnonzero(rows.label)
         over: Overlap | None = None
-        if last is not None and votes is not None and live and count:
-            over = self._overlap(kind, frame, last, votes, live)
+        if last is not None and regions is not None and len(live) and count:
+            over = self._overlap(kind, frame, last, regions, live)
             self._match(kind, frame, live, over, over.common.sum(axis=0), owner, shapes)
-        found = {entry.id for entry in owner if entry is not None}
-        missed = [entry for entry in live if entry.id not in found]
-        for entry in missed:
-            self._lose(entry)
-        lost = [entry for entry in entries.values() if entry.id not in found and not entry.label]
-        free = [label for label in range(1, count + 1) if owner[label] is None]
-        if lost and free:
-            self._find_again(kind, frame, sorted(lost, key=lambda e: e.id), squares, owner, shapes)
-        self._relate(live, over, owner)
-        for label in range(1, count + 1):
-            if owner[label] is None:
-                owner[label] = self._begin(kind, frame, label, live, over, squares)
+        found = np.zeros(len(rows.id), np.bool_)
+        found[owner[owner >= 0]] = True
+        missed = live[~found[live]]
+        rows.label[missed] = 0
+        rows.state[missed[rows.state[missed] == CONFIRMED]] = LOST
+        lost = np.flatnonzero((rows.label == 0) & ~found)
+        if len(lost) and (owner[1:] < 0).any():
+            self._find_again(kind, frame, lost, squares, owner, shapes)
+        if over is not None:
+            self._unite(rows, live, over, owner)
+        self._begin(kind, frame, live, over, squares, owner)
+        rows = self._entries[kind]
+        self._take(kind, frame, squares, owner)
         ids = np.zeros(count + 1, np.int32)
-        for label, taken in enumerate(owner):
-            if taken is not None:
-                ids[label] = taken.id
-                self._take(taken, label, frame, float(squares[label]))
-        if shapes.planes is not None:
-            known = [None if entry is None else entry.filter for entry in owner]
-            filters = fuse_all(
-                known, shapes.forms, shapes.planes, frame.pose[:3, 3], self._config, self._drift,
+        ids[1:] = rows.id[owner[1:]]
+        if shapes is not None:
+            self._fused.fuse(
+                owner, ids.tolist(), shapes, frame.pose[:3, 3], self._config,
                 self._novelty if frame.posed else None,
             )  # fmt: skip
-            for taken, made in zip(owner, filters, strict=True):
-                if taken is not None:
-                    taken.filter = made
         return ids
 
     def _overlap(
-        self, kind: str, frame: Frame, last: Observation, votes: NDArray[np.int64], live: list[Entry]
-    ) -> Overlap:
+        self, kind: str, frame: Frame, last: Observation, regions: Overlap, live: Whole
+    ) -> Overlap:  # fmt: skip
         """Overlaps of the tracks of the last frame, a row each in the order of `live`, from 1."""
         row_of = np.zeros(last.count(kind) + 1, np.int64)
-        for row, entry in enumerate(live, start=1):
-            row_of[entry.label] = row
-        rows = row_of[last.group[kind][last.points.region]]
-        return overlap(
-            votes, last.points.weight, rows, len(live), frame.seen.group[kind], frame.seen.count(kind)
-        )
+        row_of[self._entries[kind].label[live]] = np.arange(1, len(live) + 1)
+        rows, seen = row_of[last.group[kind]], frame.seen
+        return regions.of_groups(rows, len(live), seen.group[kind], seen.count(kind))
 
     def _match(
-        self, kind: str, frame: Frame, tracks: list[Entry], over: Overlap, size: Array,
-        owner: list[Entry | None], shapes: Shapes,
+        self, kind: str, frame: Frame, tracks: Whole, over: Overlap, size: Array, owner: Whole,
+        shapes: Shapes | None,
     ) -> None:  # fmt: skip
-        """Give labels without an owner to the tracks that claim them best."""
-        share = matching.union_share(over.common[1:, 1:], over.visible[1:], size[1:])
-        share[:, [entry is not None for entry in owner[1:]]] = 0.0
-        allowed = share >= self._config.min_overlap
-        rows, columns = np.nonzero(allowed)
-        color = np.stack([entry.color for entry in tracks])
-        like = matching.likeness(color[rows], frame.seen.colors[kind][1:][columns])
-        share[rows, columns] += self._config.color_weight * like
-        if shapes.planes is not None:
-            claims = np.any(allowed, axis=1)
-            known = [entry.filter if some else None for entry, some in zip(tracks, claims, strict=True)]
-            sensor = frame.pose[:3, 3]
-            gate(allowed, known, shapes.forms, shapes.planes, sensor, self._config, self._drift)
-        for t, m in matching.assign(np.where(allowed, share, 0.0)):
-            owner[m + 1] = tracks[t]
+        """Give labels without an owner to the tracks (T,), by row, that claim them best."""
+        rows = self._entries[kind]
+        score, allowed = matching.scores(
+            over.common[1:, 1:], matching.Side(over.visible[1:], rows.color[tracks]),
+            matching.Side(size[1:], frame.seen.colors[kind][1:]), owner[1:] < 0, self._config,
+        )  # fmt: skip
+        if shapes is not None:
+            ids = rows.id[tracks].tolist()
+            self._fused.gate(allowed, tracks, ids, shapes, frame.pose[:3, 3], self._config)
+        taken, labels = matching.assign(np.where(allowed, score, 0.0))
+        owner[labels + 1] = tracks[taken]
 
     def _find_again(
-        self, kind: str, frame: Frame, lost: list[Entry], squares: Array, owner: list[Entry | None],
-        shapes: Shapes,
-    ) -> None:  # fmt: skip
+        self, kind: str, frame: Frame, lost: Whole, squares: Array, owner: Whole, shapes: Shapes | None
+    ) -> None:
         """Offer the labels that are left to lost tracks."""
-        into = np.linalg.inv(frame.pose)
-        xyz = np.concatenate([entry.points for entry in lost]) @ into[:3, :3].T + into[:3, 3]
-        pixels = np.concatenate([entry.pixels for entry in lost])
-        sizes = [len(entry.points) for entry in lost]
-        row = np.repeat(np.arange(1, len(lost) + 1), sizes)
-        weight = np.repeat([entry.squares / max(len(entry.points), 1) for entry in lost], sizes)
-        tolerance = self._config.depth_tolerance
-        votes = carry(xyz, pixels, frame.seen, frame.step, tolerance, frame.margin, hides=False)
-        over = overlap(votes, weight, row, len(lost), frame.seen.group[kind], frame.seen.count(kind))
-        size = np.maximum(squares, over.common.max(axis=0))
-        self._match(kind, frame, lost, over, size, owner, shapes)
+        rows, seen = self._entries[kind], frame.seen
+        many = rows.sample[lost]
+        kept = np.arange(SAMPLE) < many[:, None]
+        row = np.repeat(np.arange(1, len(lost) + 1), many)
+        weight = np.repeat(rows.squares[lost] / np.maximum(many, 1), many)
+        points = Carried(rows.points[lost][kept], rows.pixels[lost][kept], weight, row, len(lost))
+        over = carry(
+            points, np.asarray(np.linalg.inv(frame.pose), np.float64), seen, frame.step,
+            self._config.depth_tolerance, frame.margin, hides=False,
+        )  # fmt: skip
+        each = np.arange(len(lost) + 1)
+        over = over.of_groups(each, len(lost), seen.group[kind], seen.count(kind))
+        self._match(kind, frame, lost, over, np.maximum(squares, over.common.max(axis=0)), owner, shapes)
 
-    def _lose(self, entry: Entry) -> None:
-        entry.label = 0
-        if entry.state == "confirmed":
-            entry.state = "lost"
-
-    def _relate(self, live: list[Entry], over: Overlap | None, owner: list[Entry | None]) -> None:
+    def _unite(self, rows: Entries, live: Whole, over: Overlap, owner: Whole) -> None:
         """Tracks that lie in the label of another now are merged into that."""
-        if over is None:
+        gone = np.flatnonzero((rows.label[live] == 0) & (over.visible[1:] > 0))
+        if not len(gone):
             return
-        for row, entry in enumerate(live, start=1):
-            if entry.label or not over.visible[row] > 0:
-                continue
-            label = int(np.argmax(over.common[row, 1:])) + 1
-            other = owner[label]
-            if other is not None and over.common[row, label] >= LINEAGE * over.visible[row]:
-                entry.merged_into = other.id
+        common = over.common[gone + 1, 1:]
+        label = np.argmax(common, axis=1) + 1
+        most = common[np.arange(len(gone)), label - 1] >= LINEAGE * over.visible[gone + 1]
+        inside = most & (owner[label] >= 0)
+        rows.merged_into[live[gone[inside]]] = rows.id[owner[label[inside]]]
 
     def _begin(
-        self, kind: str, frame: Frame, label: int, live: list[Entry], over: Overlap | None, squares: Array
-    ) -> Entry:
-        """A new track; that of which most of it was, and which is seen elsewhere, is its parent."""
-        parent = 0
+        self, kind: str, frame: Frame, live: Whole, over: Overlap | None, squares: Array, owner: Whole
+    ) -> None:
+        """New tracks of the labels without; that of which most of one was, and which is seen elsewhere, is
+        its parent."""
+        rows = self._entries[kind]
+        labels = np.flatnonzero(owner[1:] < 0) + 1
+        if not len(labels):
+            return
+        parent = np.zeros(len(labels), np.int64)
         if over is not None:
-            row = int(np.argmax(over.common[1:, label])) + 1
-            if live[row - 1].label and over.common[row, label] >= LINEAGE * max(squares[label], 1e-9):
-                parent = live[row - 1].id
-        entry = Entry(self._next, kind, frame.stamp_ns, self._frame, parent)
-        self._next += 1
-        self._entries[kind][entry.id] = entry
-        return entry
+            common = over.common[1:, labels]
+            row = np.argmax(common, axis=0)
+            most = common[row, np.arange(len(labels))] >= LINEAGE * np.maximum(squares[labels], 1e-9)
+            parent = np.where(most & (rows.label[live[row]] > 0), rows.id[live[row]], 0)
+        owner[labels] = len(rows.id) + np.arange(len(labels))
+        ids = self._next + np.arange(len(labels))
+        self._next += len(labels)
+        self._entries[kind] = longer(rows, Entries.new(ids, parent, frame.stamp_ns, self._frame))
+        if kind == SHAPED:
+            self._fused.append(len(labels))
 
-    def _take(self, entry: Entry, label: int, frame: Frame, squares: float) -> None:
-        """The track is this label of this frame."""
-        entry.label, entry.merged_into = label, 0
-        entry.seen += 1
-        entry.last_seen_ns, entry.last_frame = frame.stamp_ns, self._frame
-        entry.color = frame.seen.colors[entry.kind][label]
-        if entry.seen >= self._config.confirm_frames:
-            entry.state = "confirmed"
-        grown = squares > 1.1 * entry.squares
-        if grown or (self._frame - entry.sampled >= RENEW and squares > 0.7 * entry.squares):
-            self._sample(entry, label, frame, squares)
-
-    def _sample(self, entry: Entry, label: int, frame: Frame, squares: float) -> None:
-        """Keep some of its points, for the time when it is lost."""
-        points = frame.seen.points
-        mine = np.empty(SAMPLE, np.int64)
-        mine = mine[: pick(points.region, frame.seen.group[entry.kind], label, mine)]
-        entry.points = points.xyz[mine] @ frame.pose[:3, :3].T + frame.pose[:3, 3]
-        entry.pixels = points.pixel[mine]
-        entry.squares, entry.sampled = squares, self._frame
+    def _take(self, kind: str, frame: Frame, squares: Array, owner: Whole) -> None:
+        """The tracks are the labels of this frame that they own; for the time when they are lost, some of
+        their points are kept."""
+        rows, mine, seen = self._entries[kind], owner[1:], frame.seen
+        rows.label[mine] = np.arange(1, len(owner))
+        rows.merged_into[mine] = 0
+        rows.seen[mine] += 1
+        rows.last_seen_ns[mine], rows.last_frame[mine] = frame.stamp_ns, self._frame
+        rows.color[mine] = seen.colors[kind][1:]
+        rows.state[mine[rows.seen[mine] >= self._config.confirm_frames]] = CONFIRMED
+        before, now = rows.squares[mine], squares[1:]
+        old = self._frame - rows.sampled[mine] >= RENEW
+        due = np.flatnonzero((now > 1.1 * before) | (old & (now > 0.7 * before)))
+        if len(due):
+            into = np.full(len(owner), -1)
+            into[due + 1] = mine[due]
+            many = seen.pick(kind, into, frame.pose, rows.points, rows.pixels)
+            rows.sample[mine[due]], rows.squares[mine[due]] = many[due + 1], now[due]
+            rows.sampled[mine[due]] = self._frame
 
     def _prune(self, kind: str, stamp_ns: int) -> None:
         """Forget lost tracks that are too old or too many, and tentative ones that are not seen."""
-        config, entries = self._config, self._entries[kind]
-        unseen = [entry for entry in entries.values() if not entry.label]
-        gone = []
-        for entry in unseen:
-            if entry.state == "lost":
-                if (stamp_ns - entry.last_seen_ns) / 1e9 > config.keep_lost_s:
-                    gone.append(entry)
-            elif self._frame - entry.last_frame >= config.confirm_frames:
-                gone.append(entry)
-        dropped = {entry.id for entry in gone}
-        rest = [entry for entry in unseen if entry.id not in dropped]
-        rest.sort(key=lambda entry: (entry.last_frame, entry.id))
-        gone.extend(rest[: max(len(rest) - config.max_lost, 0)])
-        for entry in gone:
-            del entries[entry.id]
-            self._forgotten.append(entry.id)
+        config, rows = self._config, self._entries[kind]
+        unseen = rows.label == 0
+        if not unseen.any():
+            return
+        lost = rows.state == LOST
+        old = (stamp_ns - rows.last_seen_ns) / 1e9 > config.keep_lost_s
+        forgotten = self._frame - rows.last_frame >= config.confirm_frames
+        keep = ~(unseen & np.where(lost, old, forgotten))
+        rest = np.flatnonzero(unseen & keep)
+        if len(rest) > config.max_lost:
+            order = np.argsort(rows.last_frame[rest], kind="stable")
+            keep[rest[order[: len(rest) - config.max_lost]]] = False
+        if not keep.all():
+            self._keep(kind, keep)
 
-
-def _squares(seen: Observation, kind: str) -> Array:
-    """(M + 1,) how many squares each label has."""
-    group = seen.group[kind][seen.points.region]
-    squares: NDArray[Any] = np.bincount(group, seen.points.weight, seen.count(kind) + 1)
-    return squares
+    def _keep(self, kind: str, keep: NDArray[np.bool_]) -> None:
+        """Keep some tracks (n,), and forget the others."""
+        rows = self._entries[kind]
+        gone = rows.id[~keep].tolist()
+        self._forgotten.extend(gone)
+        self._entries[kind] = some(rows, keep)
+        if kind == SHAPED:
+            self._fused.keep(keep, gone)

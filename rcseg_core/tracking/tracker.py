@@ -7,7 +7,6 @@ tracks, which is bounded itself.
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,10 +15,9 @@ from numpy.typing import NDArray
 from rcseg_core.config import SegmenterConfig, TrackingConfig
 from rcseg_core.errors import ConfigError, InputError
 from rcseg_core.result.segmentation import Segmentation
-from rcseg_core.tracking.fusion import Local, moved
 from rcseg_core.tracking.motion import estimate_motion
 from rcseg_core.tracking.observation import Observation, observe
-from rcseg_core.tracking.prediction import carry
+from rcseg_core.tracking.prediction import Carried, Overlap, carry
 from rcseg_core.tracking.registry import Frame, Registry
 from rcseg_core.tracking.tracks import Tracks
 from rcseg_core.world import World
@@ -96,17 +94,17 @@ class Tracker:
             self._last = None
         motion, where, into, margin = self._motion(seen, given, width)
         frame = Frame(seen, stamp_ns, where, step, margin, given is not None)
-        votes = None if self._last is None else self._carried(self._last, frame, into)
-        ids = self._registry.update(frame, self._last, votes)
+        over = None if self._last is None else self._carried(self._last, frame, into)
+        ids = self._registry.update(frame, self._last, over)
         self._last, self._stamp_ns, self._fixed = seen, stamp_ns, given is not None
         self._pose, self._into = where, into if motion != "start" else np.eye(4)
-        home: NDArray[Any] = np.linalg.inv(where)
+        home = None if given is not None else np.asarray(np.linalg.inv(where), np.float64)
         return Tracks(
             stamp_ns=stamp_ns,
             surface_ids=ids["surface"],
             region_ids=ids["region"],
             object_ids=ids["object"],
-            tracks=self._registry.snapshot(None if given is not None else partial(_placed, home)),
+            tracks=self._registry.snapshot(home),
             ended=self._registry.forgotten(),
             motion=motion,
             pose=where,
@@ -146,16 +144,13 @@ class Tracker:
         margin = 0 if held else round(config.margin_px * width / REFERENCE_WIDTH_PX)
         return ("surfaces" if held else "pixels"), where, into, margin
 
-    def _carried(self, last: Observation, frame: Frame, into: Array) -> NDArray[np.int64]:
-        """Votes of the last frame's points in this one."""
-        xyz = last.points.xyz @ into[:3, :3].T + into[:3, 3]
+    def _carried(self, last: Observation, frame: Frame, into: Array) -> Overlap:
+        """How the regions of the last frame lie over those of this one."""
+        points = last.points
         return carry(
-            xyz, last.points.pixel, frame.seen, frame.step, self._config.depth_tolerance, frame.margin
-        )
-
-
-def _placed(pose: NDArray[Any], form: Local) -> Local:
-    return moved(form, pose)
+            Carried(points.xyz, points.pixel, points.weight, points.region, last.count("region")), into,
+            frame.seen, frame.step, self._config.depth_tolerance, frame.margin,
+        )  # fmt: skip
 
 
 def why_apart(gap_s: float, posed: bool, was_posed: bool, max_gap_s: float) -> str:

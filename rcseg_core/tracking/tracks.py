@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,6 +52,17 @@ class Track:
     parent: int
     merged_into: int
     fused: LocalPlane | LocalSphere | LocalCylinder | None = field(default=None, repr=False)
+
+    @classmethod
+    def of(cls, *values: Any) -> Track:
+        """One with all of its values, in their order, in half of the time: the constructor of what is frozen
+        calls for each."""
+        made = cls.__new__(cls)
+        vars(made).update(zip(NAMES, values, strict=True))
+        return made
+
+
+NAMES = tuple(one.name for one in fields(Track))
 
 
 @dataclass(frozen=True)

@@ -8,21 +8,37 @@ from rcseg_core.config import TrackingConfig
 from rcseg_core.shapes.local_forms import LocalSphere
 from rcseg_core.shapes.plane_forms import LocalPlane
 from rcseg_core.tracking import Tracker
-from rcseg_core.tracking.matching import assign, may_be_one, union_share
+from rcseg_core.tracking.matching import COLOR_SIGMA, Side, assign, may_be_one, scores
 
 CAMERA = PinholeCamera(80.0, 80.0, 31.5, 23.5)
 
 
-def test_shares_are_intersections_over_unions_however_small():
+def test_scores_are_intersections_over_unions_however_small_and_a_bonus_for_colour():
     common = np.array([[0.5, 0.0], [0.25, 3.0]])
-    share = union_share(common, np.array([0.75, 4.0]), np.array([0.5, 3.0]))
-    np.testing.assert_allclose(share, [[0.5 / 0.75, 0], [0.25 / 4.25, 0.75]])
-    assert union_share(np.zeros((1, 1)), np.zeros(1), np.zeros(1)) == 0, "nothing over nothing"
+    gray, unknown = np.full((2, 3), 90.0), np.full((2, 3), np.nan)
+    config = TrackingConfig(min_overlap=0.02)
+    free = np.ones(2, bool)
+    share = np.array([[0.5 / 0.75, 0], [0.25 / 4.25, 0.75]])
+    tracks, labels = Side(np.array([0.75, 4.0]), gray), Side(np.array([0.5, 3.0]), gray)
+    score, allowed = scores(common, tracks, labels, free, config)
+    np.testing.assert_allclose(score, np.where(share > 0, share + config.color_weight, 0))
+    assert allowed.tolist() == [[True, False], [True, True]]
+    score, _ = scores(common, tracks, labels._replace(color=unknown), free, config)
+    np.testing.assert_allclose(score, share)
+    far = labels._replace(color=gray + np.array([COLOR_SIGMA, 0, 0]))
+    score, _ = scores(common, tracks, far, free, config)
+    np.testing.assert_allclose(score[1, 1], 0.75 + config.color_weight * np.exp(-0.5))
+    score, allowed = scores(common, tracks, labels, np.array([True, False]), TrackingConfig())
+    assert allowed.tolist() == [[True, False], [False, False]] and not score[~allowed].any()
+    nothing = Side(np.zeros(1), gray[:1])
+    assert scores(np.zeros((1, 1)), nothing, nothing, free[:1], config)[0] == 0, "nothing over nothing"
 
 
 def test_no_pair_of_score_zero_is_made():
-    assert assign(np.array([[0.0, 2.0], [0.0, 3.0]])) == [(1, 1)]
-    assert assign(np.zeros((0, 3))) == [] == assign(np.zeros((2, 2)))
+    rows, columns = assign(np.array([[0.0, 2.0], [0.0, 3.0]]))
+    assert rows.tolist() == [1] and columns.tolist() == [1]
+    for empty in (np.zeros((0, 3)), np.zeros((2, 0)), np.zeros((2, 2))):
+        assert [len(part) for part in assign(empty)] == [0, 0]
 
 
 def test_two_kinds_of_shape_tell_nothing_and_two_planes_apart_are_not_one():

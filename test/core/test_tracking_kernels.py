@@ -7,12 +7,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from rcseg_core.compute.small import rotation
 from rcseg_core.shapes.local_forms import LocalCylinder, LocalSphere
 from rcseg_core.shapes.plane_forms import LocalPlane
 from rcseg_core.tracking import kernels, matching
+from rcseg_core.tracking.columns import longer
 from rcseg_core.tracking.fusion import NO_DRIFT, Filter, Related, in_fixed_frame, moved, relate
 from rcseg_core.tracking.motion import estimate_motion
-from rcseg_core.tracking.planes import Planes, carry_planes, forbid, fuse
+from rcseg_core.tracking.planes import FusedPlanes, Planes, forbid, fuse
 
 
 def covariance(rng, q, size=1e-3):
@@ -50,6 +52,14 @@ def test_the_root_of_nothing_is_nothing():
     out = np.empty((6, 5))
     kernels.symmetric_root(np.zeros((3, 3)), 3, np.empty((6, 5)), np.empty((6, 5)), out)
     assert not out[:3, :3].any()
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-9, 5e-5, 2e-4, 1.0, 3.0, 6.5])
+def test_a_vector_turns_by_its_length(size):
+    axis = np.array([0.6, -0.48, 0.64])
+    np.testing.assert_allclose(
+        rotation(axis * size), Rotation.from_rotvec(axis * size).as_matrix(), atol=1e-15
+    )
 
 
 def test_a_mean_of_frames_is_what_its_formulas_say():
@@ -178,9 +188,10 @@ def test_many_planes_at_once_are_as_each_on_its_own():
     rng = np.random.default_rng(11)
     sensor, limit, drift = rng.normal(size=3), matching.chi2_limit(1e-4, 3), np.zeros((6, 6))
     truth = [random_pose(rng) for _ in range(12)]
-    made, alone = [], []
+    made, alone, rows = FusedPlanes.none(12), [], np.arange(12)
     for frame in range(5):
-        drift = drift + covariance(rng, 6, 1e-4)
+        more_drift = covariance(rng, 6, 1e-4)
+        drift = drift + more_drift
         forms: list = []
         for i, pose in enumerate(truth):
             off = rng.normal(size=6) * (0.3 if (i, frame) in {(3, 2), (5, 4)} else 1e-3)
@@ -189,25 +200,27 @@ def test_many_planes_at_once_are_as_each_on_its_own():
             if (i, frame) == (4, 3):
                 by = np.diag([1.0, -1.0, -1.0, 1.0])
             forms.append(LocalPlane(pose @ by, covariance(rng, 3), covariance(rng, 3, 3e-4)))
-        if not made:
-            made, alone = ([Filter(form, drift) for form in forms] for _ in range(2))
-            continue
         seen = Planes.of([None, *forms])
         seen = seen._replace(row=seen.row[1:])
+        if not alone:
+            alone = [Filter(form, drift) for form in forms]
+            assert not fuse(rows, made, seen, np.zeros((12, 3)), limit).any()
+            continue
         more = seen.spread(sensor, 1e-6, 2e-6, 3e-6)
-        carry_planes(made, drift)
+        made.carry(more_drift)
         fused = [one.carried(drift).fused for one in alone]
         for form, by_row in zip(forms, more, strict=True):
             np.testing.assert_allclose(
                 by_row, matching.spread_by_pose(form, sensor, 1e-6, 2e-6, 3e-6), rtol=1e-9
             )
         allowed = np.ones((13, 12), bool)
-        forbid(allowed, Planes.of([*(one.fused for one in made), None]), seen, more, limit)
+        unknown = longer(made, FusedPlanes.none(1))
+        forbid(allowed, np.arange(13), unknown, seen, more, limit)
         assert allowed[12].all()  # what has no shape
         for t, told in enumerate(fused):
             wanted = [matching.may_be_one(told, form, more[m], 1e-4) for m, form in enumerate(forms)]
             assert allowed[t].tolist() == wanted
-        same = fuse(made, seen, more, limit)
+        same = fuse(rows, made, seen, more, limit)
         assert same.tolist() == allowed.diagonal().tolist()
         for i, form in enumerate(forms):
             if same[i]:
@@ -215,7 +228,10 @@ def test_many_planes_at_once_are_as_each_on_its_own():
                 alone[i].add(
                     Related(related.difference, related.random + np.diag(more[i]), related.systematic)
                 )
-            one, other = made[i].fused, alone[i].fused
+            else:
+                spread = form.covariance + np.diag(more[i])
+                alone[i] = Filter(LocalPlane(form.pose, spread, form.systematic), drift)
+            one, other = made.fused()[i], alone[i].fused
             np.testing.assert_allclose(one.pose, other.pose, atol=1e-12)
             np.testing.assert_allclose(one.covariance, other.covariance, rtol=1e-7, atol=1e-15)
             np.testing.assert_allclose(one.systematic, other.systematic, rtol=1e-7, atol=1e-15)
