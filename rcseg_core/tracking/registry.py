@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from rcseg_core.config import TrackingConfig
 from rcseg_core.tracking import matching
-from rcseg_core.tracking.columns import longer, some
+from rcseg_core.tracking.columns import RENEW, SAMPLE, Entries, longer, some
 from rcseg_core.tracking.fusion import NO_DRIFT, in_fixed_frame
 from rcseg_core.tracking.named_shapes import FusedShapes, Shapes, fixed_shapes
 from rcseg_core.tracking.novelty import Novelty
@@ -27,8 +27,6 @@ Array = NDArray[np.float64]
 Whole = NDArray[np.int64]
 #: Share of a new label that comes from one track, or of a lost one that lies in one label: split and union.
 LINEAGE = 0.5
-#: Points that are kept of a track, for the time when it is lost; frames after which they are renewed.
-SAMPLE, RENEW = 48, 10
 #: The kind of labels that have shapes; states by number.
 SHAPED = "surface"
 _, CONFIRMED, LOST = range(len(STATES))
@@ -47,44 +45,6 @@ class Frame(NamedTuple):
     step: int
     margin: int
     posed: bool = False
-
-
-class Entries(NamedTuple):
-    """The tracks of one kind, a row each, in the order of their ids; changed in place. See `tracks.Track`.
-
-    state : number of STATES
-    color : (n, 3) levels
-    points, pixels, sample : (n, SAMPLE, 3) in the fixed frame, (n, SAMPLE, 2), and how many of each there are
-    squares, sampled : at the frame of that number, when they were taken
-    """
-
-    id: Whole
-    first_seen_ns: Whole
-    first_frame: Whole
-    parent: Whole
-    state: Whole
-    label: Whole
-    seen: Whole
-    last_seen_ns: Whole
-    last_frame: Whole
-    merged_into: Whole
-    color: Array
-    points: Array
-    pixels: Whole
-    sample: Whole
-    squares: Array
-    sampled: Whole
-
-    @classmethod
-    def new(cls, ids: Whole, parent: Whole, stamp_ns: int, frame: int) -> Entries:
-        """Tracks that begin in this frame."""
-        n = len(ids)
-        zero = np.zeros((10, n), np.int64)
-        return cls(
-            ids, zero[0] + stamp_ns, zero[1] + frame, parent, zero[2], zero[3], zero[4], zero[5], zero[6],
-            zero[7], np.full((n, 3), np.nan), np.zeros((n, SAMPLE, 3)), np.zeros((n, SAMPLE, 2), np.int64),
-            zero[8], np.zeros(n), zero[9] + frame - RENEW,
-        )  # fmt: skip
 
 
 class Registry:

@@ -108,7 +108,7 @@ def broadcast(live, with_tf2_msgs):
     yield start
     for process in processes:
         process.terminate()
-        process.wait(10)
+        process.wait(10 * live.patience())
 
 
 @pytest.fixture
