@@ -6,7 +6,7 @@ from crafted import crafted_signals
 from oracle.naive_growth import predict as direct
 
 from rcseg_core.graph.adjacency import find_pairs
-from rcseg_core.graph.continuity import continuous_pairs, tangent
+from rcseg_core.graph.continuity import _place, continuous_pairs, tangent
 from rcseg_core.models.moments import accumulate
 from rcseg_core.models.polynomials import fit_models
 from rcseg_core.signal.units import UNIT_PX
@@ -108,3 +108,10 @@ def test_slivers_may_turn_further_unless_an_edge_lies_between():
 def test_the_cap_of_a_cylinder_is_too_wide_for_a_sliver():
     kink = np.maximum(COLS - 57.5, 0) * -15.0 / UNIT_PX
     assert joined(bowl() + kink, split=58, sliver_px=1000) == []
+
+
+def test_the_place_of_a_key_is_found_or_there_is_none():
+    keys = np.array([2, 5, 9])
+    assert [_place(keys, key) for key in (2, 5, 9)] == [0, 1, 2]
+    assert [_place(keys, key) for key in (1, 3, 7, 10)] == [-1] * 4
+    assert _place(keys[:0], 2) == -1

@@ -258,3 +258,10 @@ def test_files_that_claim_or_expand_are_one_line(tmp_path, kind):
     assert done.returncode == 2, done.stderr
     assert done.stderr.startswith("rcseg: ") and done.stderr.count("\n") == 1, done.stderr
     assert len(done.stderr) < 2000
+
+
+def test_pixels_of_a_picture_after_long_segments():
+    done, data = cv2.imencode(".jpg", np.zeros((30, 40), np.uint8))
+    picture = data.tobytes()
+    exif = b"\xff\xe1" + (700).to_bytes(2, "big") + bytes(698)
+    assert done and claimed_pixels(picture[:2] + exif + picture[2:]) == 30 * 40

@@ -38,6 +38,7 @@ from rcseg_ros.cli import main
 from rcseg_ros.frames.conversions import decode_camera_info
 from rcseg_ros.recordings.bag import Recording
 from rcseg_ros.recordings.result_bag import definition_text, result_types, serialize
+from rcseg_ros.recordings.storage import RawMessage
 from rcseg_ros.recordings.topics import find_topics
 
 
@@ -475,4 +476,41 @@ def test_an_sqlite3_file_with_nothing_to_read_is_refused(content, tmp_path):
     path = tmp_path / "bag.db3"
     path.write_bytes(content)
     with pytest.raises(InputError, match="cannot be read"):
+        Recording(path)
+
+
+@pytest.mark.parametrize(("mark", "order"), [(b"\0\1\0\0", "<"), (b"\0\0\0\0", ">")])
+def test_the_stamp_of_a_message_is_that_of_its_header(mark, order):
+    def stamped(sec, nanosec):
+        return RawMessage("/t", 77, mark + struct.pack(order + "iI", sec, nanosec)).stamp_ns
+
+    assert stamped(3, 5) == 3_000_000_005
+    assert stamped(0, 5) == 5
+    assert stamped(0, 0) == 77  # the time of recording
+    assert RawMessage("/t", 77, mark).stamp_ns == 77
+
+
+@pytest.mark.parametrize("kind", ["mcap", "sqlite", "cut"])
+def test_a_span_holds_its_first_moment_and_not_its_last(kind, tmp_path):
+    entries = depth_entries(4)
+    path = (write_sqlite if kind == "sqlite" else write_mcap)(tmp_path / "bag.mcap", entries)
+    if kind == "cut":  # read without the index
+        path.write_bytes(path.read_bytes()[:-8])
+    times = sorted({entry.log_ns for entry in entries})
+    with Recording(path) as recording:
+        found = [raw.log_ns for raw in recording.messages([DEPTH], (times[1], times[3]))]
+    assert found == [times[1], times[2]]
+
+
+def test_topics_of_sqlite3_have_their_definitions(tmp_path):
+    with Recording(write_sqlite(tmp_path / "bag", depth_entries(2))) as recording:
+        for topic in recording.topics.values():
+            assert (topic.count, topic.is_idl, topic.encoding) == (2, False, "cdr")
+            assert "std_msgs/Header header" in topic.definition
+
+
+def test_why_an_unreadable_recording_cannot_be_read(tmp_path):
+    path = tmp_path / "bag.db3"
+    path.write_bytes(b"rubbish" * 100)
+    with pytest.raises(InputError, match=r"cannot be read: readable for 0 messages: \w+"):
         Recording(path)

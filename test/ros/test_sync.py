@@ -258,3 +258,10 @@ def test_what_waits_is_taken_in_again_under_other_stamps():
     assert dropped(sync) == {"unpaired_color": 1}
     (pair,) = sync.add_color(12 * MS, 12)
     assert pair.range == 9
+
+
+def test_a_next_image_that_would_be_as_near_is_not_waited_for():
+    sync = FrameSync(slop_ns=20 * MS)
+    assert sync.add_color(97 * MS, "color") == [] == sync.add_range(100 * MS, "range")
+    (pair,) = sync.add_color(103 * MS, "next")  # of two equally near the earlier
+    assert pair.color == "color"
