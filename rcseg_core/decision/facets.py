@@ -125,11 +125,9 @@ def _basis(x, y, terms, out):  # type: ignore[no-untyped-def]
 
 
 @bare
-def _fit(cells, owner, which, cap2, terms, coef, basis, gram):  # type: ignore[no-untyped-def]
-    """Least squares of the cells with this owner that a first model misses by no more than the cap, in place.
-
-    coef (25,) holds the first model if coef[0] is finite. Returns whether there were enough cells.
-    """
+def _sum_terms(cells, owner, which, cap2, terms, coef, basis, gram):  # type: ignore[no-untyped-def]
+    """Normal equations of `_fit`: lower triangle of gram (terms + 1, terms), right side in its last row; and
+    the number of cells in them."""
     gram[: terms + 1, :terms] = 0.0
     right = gram[terms]
     count = 0
@@ -150,6 +148,49 @@ def _fit(cells, owner, which, cap2, terms, coef, basis, gram):  # type: ignore[n
             right[a] += w * basis[a] * cells.value[i]
             for b in range(a + 1):
                 gram[a, b] += w * basis[a] * basis[b]
+    return count
+
+
+@bare
+def _sum_plane(cells, owner, which, cap2, coef, gram):  # type: ignore[no-untyped-def]
+    """`_sum_terms` for a plane, which most fits are of: the same to the bit, without a basis in memory."""
+    first = np.isfinite(coef[0])
+    c0, c1, c2 = coef[0], coef[1], coef[2]
+    g00 = g10 = g11 = g20 = g21 = g22 = r0 = r1 = r2 = 0.0
+    count = 0
+    for i in range(cells.value.shape[0]):
+        if owner[i] != which:
+            continue
+        x, y, v, w = cells.place[i, 0], cells.place[i, 1], cells.value[i], cells.weight[i]
+        miss = v - c0 - c1 * x - c2 * y
+        if first and miss * miss > cap2:
+            continue
+        count += 1
+        wx, wy = w * x, w * y
+        g00 += w
+        g10 += wx
+        g11 += wx * x
+        g20 += wy
+        g21 += wy * x
+        g22 += wy * y
+        r0 += w * v
+        r1 += wx * v
+        r2 += wy * v
+    gram[0, 0], gram[1, 0], gram[1, 1], gram[2, 0], gram[2, 1], gram[2, 2] = g00, g10, g11, g20, g21, g22
+    gram[PLANE, 0], gram[PLANE, 1], gram[PLANE, 2] = r0, r1, r2
+    return count
+
+
+@bare
+def _fit(cells, owner, which, cap2, terms, coef, basis, gram):  # type: ignore[no-untyped-def]
+    """Least squares of the cells with this owner that a first model misses by no more than the cap, in place.
+
+    coef (25,) holds the first model if coef[0] is finite. Returns whether there were enough cells.
+    """
+    if terms == PLANE:
+        count = _sum_plane(cells, owner, which, cap2, coef, gram)
+    else:
+        count = _sum_terms(cells, owner, which, cap2, terms, coef, basis, gram)
     if count < terms + 1:
         return False
     ridge = 1e-9 * gram[0, 0]
@@ -159,7 +200,7 @@ def _fit(cells, owner, which, cap2, terms, coef, basis, gram):  # type: ignore[n
             for c in range(b):
                 total -= gram[a, c] * gram[b, c]
             gram[a, b] = np.sqrt(max(total, ridge)) if a == b else total / gram[b, b]
-    solve_triangular(gram, terms, right, coef)
+    solve_triangular(gram, terms, gram[terms], coef)
     coef[terms:] = 0.0
     return True
 
@@ -188,6 +229,22 @@ def _costs(cells, coef, terms, cap2, unit, out):  # type: ignore[no-untyped-def]
         y = cells.place[i, 1]
         miss = cells.value[i] - c0 - c1 * x - c2 * y - c3 * (x * x) - c4 * (x * y) - c5 * (y * y)
         out[i] = cells.weight[i] * min(miss * miss, cap2) / unit
+
+
+@bare
+def _gains(cells, planes, cost, unit, gains):  # type: ignore[no-untyped-def]
+    """gains[h] = what plane h would shorten the costs of all cells by, several planes at once.
+
+    planes : (3, >= H); cost : (n,)
+    """
+    first, second, third = planes[0], planes[1], planes[2]
+    gains[:] = 0.0
+    for i in range(cells.value.shape[0]):
+        x, y, v, w, before = cells.place[i, 0], cells.place[i, 1], cells.value[i], cells.weight[i], cost[i]
+        for h in range(gains.shape[0]):
+            miss = v - first[h]
+            miss -= second[h] * x + third[h] * y
+            gains[h] += max(before - w * miss * miss / unit, 0.0)
 
 
 @bare
@@ -244,20 +301,23 @@ def _settle(cells, coefs, terms, count, owner, cap2, unit, rounds, table, basis,
 
 
 @bare
-def _one_polynomial(cells, single, cap2, wide, unit, price, trial, basis, gram):  # type: ignore[no-untyped-def]
-    """Length of the shortest description by one polynomial; single (n,) : zeros; wide : cap of lengths."""
+def _one_polynomial(cells, single, cap2, wide, unit, price, enough, trial, basis, gram):  # type: ignore[no-untyped-def]
+    """Length of the shortest description by one polynomial; single (n,) : zeros; wide : cap of lengths.
+
+    Once it is not above `enough` nobody wants it shorter, and what cannot be as short is not tried.
+    """
     shortest = np.inf
-    for degree in (PLANE, QUADRIC, 9, QUARTIC):
+    for terms in (PLANE, QUADRIC, 9, QUARTIC):
+        if shortest <= enough or price * (terms + 1) > enough:
+            break
         trial[0] = np.nan
-        if not _fit(cells, single, 0, cap2, degree, trial, basis, gram):
-            continue
-        for _ in range(2):
-            total = price * (degree + 1)
-            for i in range(cells.value.shape[0]):
-                total += _cost(cells, i, trial, degree, wide, unit, basis)
-            shortest = min(shortest, total)
-            if not _fit(cells, single, 0, cap2, degree, trial, basis, gram):
+        for _ in range(2):  # the second time without the cells that the first model misses
+            if not _fit(cells, single, 0, cap2, terms, trial, basis, gram):
                 break
+            total = price * (terms + 1)
+            for i in range(cells.value.shape[0]):
+                total += _cost(cells, i, trial, terms, wide, unit, basis)
+            shortest = min(shortest, total)
     return shortest
 
 
@@ -303,19 +363,21 @@ def describe(cells, cap2, wide, fine, unit, price, flat, owner, coefs, terms, jo
     flat : slope of a surface tilted by 45 degrees
     Out: owner (n,) surface of each cell, coefs (MOST + 1, 25), terms (MOST + 1,); joints (MOST, MOST, 3), see
     `_joints`
-    Returns the number of surfaces, its length and that of one curved surface.
+    Returns the number of surfaces, its length and that of one curved surface; which of the two is the shorter
+    is certain, how much longer the other one is may not be.
     """
     n = cells.value.shape[0]
     basis = np.empty(QUARTIC)
     gram = np.empty((QUARTIC + 1, QUARTIC))
     trial = np.empty(QUARTIC)
     single = np.zeros(n, np.int64)
-    curved = _one_polynomial(cells, single, cap2, wide, unit, price, trial, basis, gram)
-    if curved <= 2 * (PLANE + 1) * price:  # no two surfaces are as short
+    least = 2 * (PLANE + 1) * price
+    curved = _one_polynomial(cells, single, cap2, wide, unit, price, least, trial, basis, gram)
+    if curved <= least:  # no two surfaces are as short
         return 1, curved, curved
     # hypotheses: planes round some of the cells, near and farther
     stride = max(1, n // HYPOTHESES)
-    planes = np.empty((2 * n, PLANE))
+    planes = np.empty((PLANE, 2 * n))
     found = 0
     ring = np.empty(n, np.int64)
     seen = np.full(n, -1, np.int64)
@@ -347,7 +409,7 @@ def describe(cells, cap2, wide, fine, unit, price, flat, owner, coefs, terms, jo
                     many += 1
             trial[0] = np.nan
             if many >= LEAST_CELLS and _fit(cells, inside, 1, cap2, PLANE, trial, basis, gram):
-                planes[found] = trial[:PLANE]
+                planes[:, found] = trial[:PLANE]
                 found += 1
     # the one that shortens the description most, again and again
     cost = np.empty(n)
@@ -356,23 +418,19 @@ def describe(cells, cap2, wide, fine, unit, price, flat, owner, coefs, terms, jo
         cost[i] = cells.weight[i] * wide / unit
         owner[i] = 0
     count = 0
-    trial[:] = 0.0
+    gains = np.empty(found)
     while count < MOST:
         best = price
         choice = -1
+        _gains(cells, planes, cost, unit, gains)
         for h in range(found):
-            gain = 0.0
-            for i in range(n):
-                miss = cells.value[i] - planes[h, 0]
-                miss -= planes[h, 1] * cells.place[i, 0] + planes[h, 2] * cells.place[i, 1]
-                gain += max(cost[i] - cells.weight[i] * miss * miss / unit, 0.0)
-            if gain > best:
-                best = gain
+            if gains[h] > best:
+                best = gains[h]
                 choice = h
         if choice < 0:
             break
         coefs[count] = 0.0
-        coefs[count, :PLANE] = planes[choice]
+        coefs[count, :PLANE] = planes[:, choice]
         terms[count] = PLANE
         for _ in range(2):  # to all that it explains
             inside[:] = 0
@@ -450,7 +508,7 @@ def describe(cells, cap2, wide, fine, unit, price, flat, owner, coefs, terms, jo
         return 1, curved, curved
     _joints(cells, owner, coefs, flat, joints)
     length = _length(inside_only, coefs, terms, count, owner, wide, unit, price, table)
-    curved = _one_polynomial(inside_only, single, cap2, wide, unit, price, trial, basis, gram)
+    curved = _one_polynomial(inside_only, single, cap2, wide, unit, price, length, trial, basis, gram)
     if length < curved:
         enough = length - price * 10
         work = np.empty((4, 9))

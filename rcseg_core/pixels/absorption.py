@@ -171,26 +171,48 @@ def _grow(  # type: ignore[no-untyped-def]
 
 
 @bare
+def _look_at(labels, settled, row, above, below, waiting):  # type: ignore[no-untyped-def]
+    """waiting[col] = whether a pixel of a row has another label beside it and is not settled."""
+    here, over, under, done = labels[row], labels[above], labels[below], settled[row]
+    width = here.shape[0]
+    for col in range(1, width - 1):
+        k = here[col]
+        differs = (over[col] != k) | (under[col] != k) | (here[col - 1] != k) | (here[col + 1] != k)
+        waiting[col] = differs & (done[col] == 0)
+    for col in (0, width - 1):  # they are looked at whatever is beside them
+        waiting[col] = done[col] == 0
+
+
+@bare
 def _refine(  # type: ignore[no-untyped-def]
-    image, flags, labels, leaves, models, n_range, law, color_eps2, before, smoothness, settled, first, last
-):
+    image, flags, labels, leaves, models, n_range, law, color_eps2, before, smoothness, settled, asleep,
+    waiting, first, last,
+):  # fmt: skip
     """One raster pass over rows: each boundary pixel takes the label of least cost, smoothness included.
 
     settled : (H, W) uint8, 1 where a pixel was looked at and no label round it has changed since
+    asleep : (H,) uint8, 1 where this holds of all pixels of a row that have another label beside them
+    waiting : (W,) bool, work
     Returns the number of pixels that changed.
     """
     height, width = labels.shape
     moved = 0
     for row in range(first, last):
+        if asleep[row] != 0:
+            continue
+        asleep[row] = 1
         above = max(row - 1, 0)
         below = min(row + 1, height - 1)
+        _look_at(labels, settled, row, above, below, waiting)
         for col in range(width):
+            if not waiting[col]:
+                continue
             k = labels[row, col]
             right = labels[row, min(col + 1, width - 1)]
             left = labels[row, max(col - 1, 0)]
             up = labels[above, col]
             down = labels[below, col]
-            # most pixels are inside of their region
+            # a pixel before it may have moved
             if (up == k) & (down == k) & (left == k) & (right == k):
                 continue
             if k <= 0 or settled[row, col] != 0:
@@ -236,8 +258,10 @@ def _refine(  # type: ignore[no-untyped-def]
                 leaves[row, col] = leaves[best_at // width, best_at % width]
                 moved += 1
                 for rr in range(above, below + 1):
+                    asleep[rr] = 0
                     for cc in range(max(col - 1, 0), min(col + 2, width)):
                         settled[rr, cc] = 0
+                waiting[min(col + 1, width - 1)] = True
     return moved
 
 
@@ -275,12 +299,14 @@ def refine(
     height = len(labels)
     rows = bands(height)
     inner = [0] * len(rows)
-    settled, before = np.zeros(labels.shape, np.uint8), before or alone()
+    settled, asleep = np.zeros(labels.shape, np.uint8), np.zeros(height, np.uint8)
+    before = before or alone()
 
     def refine_rows(first: int, last: int) -> int:
         moved: int = _refine(
             signals.image, signals.flags, labels, leaves, models, signals.n_range, signals.law,
-            signals.color_eps2, before, SMOOTHNESS, settled, first, last,
+            signals.color_eps2, before, SMOOTHNESS, settled, asleep, np.empty(labels.shape[1], np.bool_),
+            first, last,
         )  # fmt: skip
         return moved
 
