@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from rcseg_core.compute.jit import bare
 from rcseg_core.compute.parallel import BANDS, over_bands
+from rcseg_core.graph.components import mark_borders
 
 
 class Pairs(NamedTuple):
@@ -133,19 +134,22 @@ def enter(keys, tally, key, count, range_met, color_met):  # type: ignore[no-unt
 
 
 @bare
-def touching(cells, met, first, last, count, keys, tally):  # type: ignore[no-untyped-def]
+def touching(cells, met, first, last, count, keys, tally, marked):  # type: ignore[no-untyped-def]
     """Count 4-neighbour pixel pairs of different cells by their two labels, in an open-addressed hash table.
 
     first, last : rows of the upper or left pixel of each pair
     keys : (size,) int64 filled with -1, size a power of two; tally : (size, 3) float64: pixel pairs,
-    those that met a range edge, those that met a colour edge. Returns the number of entries, or -1 when the
-    table is too full.
+    those that met a range edge, those that met a colour edge; marked : (W,) bool, work. Returns the number of
+    entries, or -1 when the table is too full.
     """
     height, width = cells.shape
     entries = 0
     for row in range(first, last):
         below = min(row + 1, height - 1)
+        mark_borders(cells, row, marked)
         for col in range(width):
+            if not marked[col]:
+                continue
             a = cells[row, col]
             right = cells[row, min(col + 1, width - 1)]
             under = cells[below, col]
@@ -213,7 +217,8 @@ def _count_pairs(
     entries = [0] * BANDS
 
     def count_band(i: int, first: int, last: int) -> None:
-        entries[i] = touching(cells, met, first, last, count, keys[i], tally[i])
+        marked = np.empty(cells.shape[1], np.bool_)
+        entries[i] = touching(cells, met, first, last, count, keys[i], tally[i], marked)
 
     over_bands(cells.shape[0], count_band)
     total = entries[0]

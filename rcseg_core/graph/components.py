@@ -10,6 +10,22 @@ from rcseg_core.signal.signals import INVALID
 
 
 @bare
+def mark_borders(labels, row, marked):  # type: ignore[no-untyped-def]
+    """marked[col] = whether a pixel of a row has another label beside it (4-neighbours), always at both ends.
+
+    Several columns at once: most pixels lie inside of their region, and to pass over them is most of the time
+    of what looks at borders only. marked : (W,) bool
+    """
+    width = labels.shape[1]
+    here, over, under = labels[row], labels[max(row - 1, 0)], labels[min(row + 1, labels.shape[0] - 1)]
+    for col in range(1, width - 1):
+        k = here[col]
+        marked[col] = (over[col] != k) | (under[col] != k) | (here[col - 1] != k) | (here[col + 1] != k)
+    marked[0] = True
+    marked[width - 1] = True
+
+
+@bare
 def _count(labels, flags, total):  # type: ignore[no-untyped-def]
     for row in range(labels.shape[0]):
         found = 0

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from rcseg_core.compute.jit import bare
 from rcseg_core.graph.adjacency import Pairs
+from rcseg_core.graph.components import mark_borders
 from rcseg_core.graph.grouping import Grouped
 from rcseg_core.models.polynomials import Models
 from rcseg_core.signal.signals import Signals, local_scales
@@ -62,17 +63,19 @@ def _place(keys, key):  # type: ignore[no-untyped-def]
 
 
 @bare
-def _border(labels, keys, models, c, law, slope, out):  # type: ignore[no-untyped-def]
+def _border(labels, keys, models, c, law, slope, marked, out):  # type: ignore[no-untyped-def]
     """Sums over the border of each pair: squared distance over tolerance, angle, pixel pairs; out (E, 3).
 
     keys : (E,) int64, sorted, lower label * N + higher label of each pair, N = labels of the models
+    marked : (W,) bool, work
     """
     count = models.degree.shape[0]
     height, width = labels.shape
     for row in range(height):
+        mark_borders(labels, row, marked)
         for col in range(width):
             i = labels[row, col]
-            if i <= 0:
+            if i <= 0 or not marked[col]:
                 continue
             for d in range(2):
                 r = row + (d == 1)
@@ -129,7 +132,8 @@ def continuous_pairs(
         keys = a[rows] * (count + 1) + b[rows]
         rows, keys = rows[np.argsort(keys)], np.sort(keys)
         sums = np.zeros((rows.size, 3))
-        _border(labels, keys, models, signals.n_range - 1, signals.law, signals.slope, sums)
+        marked = np.empty(labels.shape[1], np.bool_)
+        _border(labels, keys, models, signals.n_range - 1, signals.law, signals.slope, marked, sums)
         with np.errstate(invalid="ignore", divide="ignore"):
             distance2, angle = sums[:, 0] / sums[:, 2], sums[:, 1] / sums[:, 2]
             width = sizes[small[rows]] / sums[:, 2]

@@ -234,6 +234,11 @@ def _sum_moves(image, flags, before, after, center, table, power, cross, energy,
     """The same for pixels whose label changed: away from the old one, to the new one. flags : none is set."""
     height, width = before.shape
     for row in range(height):
+        differ = 0
+        for col in range(width):
+            differ |= before[row, col] ^ after[row, col]
+        if differ == 0:
+            continue
         col = 0
         while col < width:
             old = before[row, col]

@@ -231,6 +231,8 @@ def _try_window(  # type: ignore[no-untyped-def]
     center = size // 2
     count = 0
     for i in range(size):
+        if count + (size - i) * size < min_valid * size * size:
+            return 0
         for j in range(size):
             if flags[row0 + i, col0 + j] != 0:
                 continue
@@ -276,6 +278,13 @@ def _try_window(  # type: ignore[no-untyped-def]
     return taken
 
 
+@bare
+def _lengthen(run, edges, labels):  # type: ignore[no-untyped-def]
+    """run[col] = rows without edge or seed that end in this one, several columns at once."""
+    for col in range(run.shape[0]):
+        run[col] = run[col] + 1 if (edges[col] == 0) & (labels[col] == 0) else 0
+
+
 @kernel
 def place_windows(  # type: ignore[no-untyped-def]
     image, flags, edges, first, last, n_range, law, eps2_c, sizes, max_window, half, cut, robust, subsets,
@@ -296,34 +305,33 @@ def place_windows(  # type: ignore[no-untyped-def]
         np.empty(most, np.bool_),
     )
     count = 0
-    run = np.empty(width, np.int64)
+    run = np.empty(width, np.int32)
     for size in sizes:
         run[:] = 0
         for row in range(first, last):
-            streak = 0
-            for col in range(width):
-                free = edges[row, col] == 0 and labels[row, col] == 0
-                run[col] = run[col] + 1 if free else 0
-                streak = streak + 1 if run[col] >= size else 0
-                if streak < size:
+            _lengthen(run, edges[row], labels[row])
+            col0 = 0
+            while col0 + size <= width:
+                col = col0 + size - 1
+                while col >= col0 and run[col] >= size:
+                    col -= 1
+                if col >= col0:  # no window reaches across it
+                    col0 = col + 1
                     continue
-                row0 = row - size + 1
-                col0 = col - size + 1
                 taken = _try_window(
-                    image, flags, row0, col0, size, n_range, law, eps2_c, half, cut,
+                    image, flags, row - size + 1, col0, size, n_range, law, eps2_c, half, cut,
                     size <= max_window, robust and size <= max_window, subsets, min_valid, work, labels,
                     count + 1,
                 )  # fmt: skip
                 if taken > 0:
                     count += 1
-                    for c in range(col0, col + 1):
-                        run[c] = 0
-                    streak = 0
+                    run[col0 : col0 + size] = 0
+                    col0 += size
                 else:
                     # a window that failed tells of its neighbours: step by half a window, in rows as well
-                    streak = size // 2
-                    for c in range(col0, col0 + size - size // 2):
-                        run[c] = size // 2
+                    step = size - size // 2
+                    run[col0 : col0 + step] = size // 2
+                    col0 += step
     return count
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from rcseg_core.compute.inline import inlined
 from rcseg_core.compute.jit import bare
 from rcseg_core.compute.parallel import bands, over_bands
-from rcseg_core.graph.components import count_unassigned
+from rcseg_core.graph.components import count_unassigned, mark_borders
 from rcseg_core.models.polynomials import Models, pixel_cost
 from rcseg_core.signal.signals import COLOR_OUTLIER, INVALID, RANGE_OUTLIER, Signals
 
@@ -171,28 +171,15 @@ def _grow(  # type: ignore[no-untyped-def]
 
 
 @bare
-def _look_at(labels, settled, row, above, below, waiting):  # type: ignore[no-untyped-def]
-    """waiting[col] = whether a pixel of a row has another label beside it and is not settled."""
-    here, over, under, done = labels[row], labels[above], labels[below], settled[row]
-    width = here.shape[0]
-    for col in range(1, width - 1):
-        k = here[col]
-        differs = (over[col] != k) | (under[col] != k) | (here[col - 1] != k) | (here[col + 1] != k)
-        waiting[col] = differs & (done[col] == 0)
-    for col in (0, width - 1):  # they are looked at whatever is beside them
-        waiting[col] = done[col] == 0
-
-
-@bare
 def _refine(  # type: ignore[no-untyped-def]
     image, flags, labels, leaves, models, n_range, law, color_eps2, before, smoothness, settled, asleep,
-    waiting, first, last,
+    marked, first, last,
 ):  # fmt: skip
     """One raster pass over rows: each boundary pixel takes the label of least cost, smoothness included.
 
     settled : (H, W) uint8, 1 where a pixel was looked at and no label round it has changed since
     asleep : (H,) uint8, 1 where this holds of all pixels of a row that have another label beside them
-    waiting : (W,) bool, work
+    marked : (W,) bool, work
     Returns the number of pixels that changed.
     """
     height, width = labels.shape
@@ -203,16 +190,16 @@ def _refine(  # type: ignore[no-untyped-def]
         asleep[row] = 1
         above = max(row - 1, 0)
         below = min(row + 1, height - 1)
-        _look_at(labels, settled, row, above, below, waiting)
+        mark_borders(labels, row, marked)
         for col in range(width):
-            if not waiting[col]:
+            if not marked[col]:
                 continue
             k = labels[row, col]
             right = labels[row, min(col + 1, width - 1)]
             left = labels[row, max(col - 1, 0)]
             up = labels[above, col]
             down = labels[below, col]
-            # a pixel before it may have moved
+            # a pixel before it may have joined its region
             if (up == k) & (down == k) & (left == k) & (right == k):
                 continue
             if k <= 0 or settled[row, col] != 0:
@@ -261,7 +248,7 @@ def _refine(  # type: ignore[no-untyped-def]
                     asleep[rr] = 0
                     for cc in range(max(col - 1, 0), min(col + 2, width)):
                         settled[rr, cc] = 0
-                waiting[min(col + 1, width - 1)] = True
+                marked[min(col + 1, width - 1)] = True
     return moved
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rcseg_core.compute.jit import bare
+from rcseg_core.graph.components import mark_borders
 from rcseg_core.graph.continuity import tangent
 from rcseg_core.models.polynomials import Models, predict
 from rcseg_core.signal.edges import DEPTH
@@ -108,24 +109,22 @@ def _vote(labels, sides, channel, reach, row, col, down, right, slot, votes):  #
 
 
 @bare
-def collect(labels, sides, channel, reach, queue, votes):  # type: ignore[no-untyped-def]
+def collect(labels, sides, channel, reach, queue, votes, marked):  # type: ignore[no-untyped-def]
     """Hold the votes, and list the pixels beside a border of two surfaces in queue[0] (flat indices).
 
-    Returns their number, or -1 when the table of votes is too full.
+    marked : (W,) bool, work. Returns their number, or -1 when the table of votes is too full.
     """
     height, width = labels.shape
     surface_of = sides.surface_of
     end = 0
     entries = 0
     for row in range(height):
+        mark_borders(labels, row, marked)
         for col in range(width):
+            if not marked[col]:
+                continue
             k = labels[row, col]
-            differs = False
-            for d in range(4):
-                r = min(max(row + (d == 1) - (d == 0), 0), height - 1)
-                c = min(max(col + (d == 3) - (d == 2), 0), width - 1)
-                differs |= labels[r, c] != k
-            if not differs or surface_of[k] == 0:
+            if surface_of[k] == 0:
                 continue
             beside = False
             for d in range(4):
@@ -290,10 +289,10 @@ def sharpen(
     """
     size = 1 << int(np.ceil(np.log2(16 * (sides.doubt.size + 16))))
     queue = np.empty((2, labels.size), np.int64)
-    end = -1
+    end, marked = -1, np.empty(labels.shape[1], np.bool_)
     while end < 0:
         votes = Votes(np.full(size, -1, np.int64), np.zeros(size), np.zeros(size))
-        end = collect(labels, sides, signals.n_range - 1, reach, queue, votes)
+        end = collect(labels, sides, signals.n_range - 1, reach, queue, votes, marked)
         size *= 2
     pixels = Pixels(signals.image, signals.flags, signals.law, signals.n_range, signals.color_eps2)
     itself, queued = np.arange(sides.surface_of.size), np.zeros(labels.shape, np.uint8)
