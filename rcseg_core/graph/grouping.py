@@ -131,7 +131,7 @@ def _size(state, k):  # type: ignore[no-untyped-def]
     return state.planes.shape[k, 0] if state.flat else state.moments.power[k, 0, 0]
 
 
-@bare
+@inlined
 def _evaluate(graph, edge, state, gated, limit, heap, size):  # type: ignore[no-untyped-def]
     """Compare the ends of an edge; push the pair if it is allowed. Returns the size of the heap."""
     graph.version[edge] += 1
@@ -234,46 +234,51 @@ def _run(graph, state, scratch, gated, limit, merges, heights):  # type: ignore[
         full_at[k] = _size(state, k)
         if not state.flat:
             own_residuals(state.moments, k, state.rule, state.work, state.own[k])
-    size = 0
     for edge in range(edges):
-        size = _evaluate(graph, edge, state, gated, limit, heap, size)
-    comparisons = edges
+        fresh[edge] = edge
+    fresh_count = edges
+    comparisons = 0
     merged = 0
-    while size > 0:
-        edge = heap.edge[0]
-        current = graph.alive[edge] and graph.version[edge] == heap.version[0]
-        size -= 1
-        _sift_down(heap, 0, size, heap.value[size], heap.pair[size], heap.edge[size], heap.version[size])
-        if not current:
-            continue
-        i = graph.ends[edge, 0]
-        j = graph.ends[edge, 1]
-        n_i = _size(state, i)
-        n_j = _size(state, j)
-        if n_i + n_j != graph.pixels[edge]:
-            size = _evaluate(graph, edge, state, gated, limit, heap, size)
-            comparisons += 1
-            continue
-        keep, gone = (i, j) if n_i > n_j or (n_i == n_j and i < j) else (j, i)
-        merges[merged, 0] = keep
-        merges[merged, 1] = gone
-        heights[merged] = graph.height[edge]
-        merged += 1
-        _join(keep, gone, state)
-        fresh_count = merge_edges(graph, keep, gone, fresh)
-        grown = _size(state, keep)
-        if grown >= GROWTH * full_at[keep]:
-            full_at[keep] = grown
-            fresh_count = 0
-            half = graph.first[keep]
-            while half >= 0:
-                if graph.alive[half // 2]:
-                    fresh[fresh_count] = half // 2
-                    fresh_count += 1
-                half = graph.following[half]
+    size = 0
+    while fresh_count > 0:
         for at in range(fresh_count):
             size = _evaluate(graph, fresh[at], state, gated, limit, heap, size)
         comparisons += fresh_count
+        fresh_count = 0
+        while size > 0 and fresh_count == 0:
+            edge = heap.edge[0]
+            current = graph.alive[edge] and graph.version[edge] == heap.version[0]
+            size -= 1
+            _sift_down(
+                heap, 0, size, heap.value[size], heap.pair[size], heap.edge[size], heap.version[size]
+            )
+            if not current:
+                continue
+            i = graph.ends[edge, 0]
+            j = graph.ends[edge, 1]
+            n_i = _size(state, i)
+            n_j = _size(state, j)
+            if n_i + n_j != graph.pixels[edge]:
+                fresh[0] = edge
+                fresh_count = 1
+                continue
+            keep, gone = (i, j) if n_i > n_j or (n_i == n_j and i < j) else (j, i)
+            merges[merged, 0] = keep
+            merges[merged, 1] = gone
+            heights[merged] = graph.height[edge]
+            merged += 1
+            _join(keep, gone, state)
+            fresh_count = merge_edges(graph, keep, gone, fresh)
+            grown = _size(state, keep)
+            if grown >= GROWTH * full_at[keep]:
+                full_at[keep] = grown
+                fresh_count = 0
+                half = graph.first[keep]
+                while half >= 0:
+                    if graph.alive[half // 2]:
+                        fresh[fresh_count] = half // 2
+                        fresh_count += 1
+                    half = graph.following[half]
     return merged, comparisons
 
 

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rcseg_core.compute.inline import inlined
 from rcseg_core.compute.jit import bare
 from rcseg_core.compute.parallel import BANDS, over_bands
 from rcseg_core.signal.units import UNIT_PX
@@ -98,7 +99,7 @@ def power_table(width: int) -> NDArray[np.float64]:
     return table
 
 
-@bare
+@inlined
 def _sum_channel(image, flags, row, start, stop, c, center, run):  # type: ignore[no-untyped-def]
     """Sums of x^a s over the unflagged pixels of a run into run (9,), and of s^2 into run[5]."""
     r0 = r1 = r2 = r3 = r4 = energy = 0.0
@@ -123,7 +124,7 @@ def _sum_channel(image, flags, row, start, stop, c, center, run):  # type: ignor
     run[5] = energy
 
 
-@bare
+@inlined
 def _sum_three(image, flags, row, start, stop, c, center, runs):  # type: ignore[no-untyped-def]
     """The same for channels c, c + 1, c + 2 at once, up to x^2, into runs (3, 9)."""
     a0 = a1 = a2 = b0 = b1 = b2 = c0 = c1 = c2 = ea = eb = ec = 0.0
@@ -162,7 +163,7 @@ def _sum_three(image, flags, row, start, stop, c, center, runs):  # type: ignore
     runs[2, 2] = c2
 
 
-@bare
+@inlined
 def _add_run(image, flags, row, start, stop, k, sign, center, table, power, cross, energy, run):  # type: ignore[no-untyped-def]
     """Add (sign 1) or take away (-1) a run: summed in x, then spread over powers of y.
 
