@@ -27,8 +27,8 @@ _budget = bare(error_budget)
 
 
 @bare
-def residual_table(moments, n_range, exponents, gram, work, out):  # type: ignore[no-untyped-def]
-    """out[k, modality, degree - 1]: residual sum of squares of region k for each degree, eq. (14).
+def residual_table(moments, n_range, exponents, first, last, gram, work, out):  # type: ignore[no-untyped-def]
+    """out[k, modality, degree - 1]: residual sum of squares of each degree for regions first..last-1 (14).
 
     exponents : (p, 2) terms of the highest degree, those of each lower one first (`nested_exponents`);
     gram : (p + 1, p), work : (p,) scratch. With R = L L^T in that order, z = L^-1 v gives the residual of all
@@ -37,7 +37,7 @@ def residual_table(moments, n_range, exponents, gram, work, out):  # type: ignor
     channels = moments.energy.shape[1]
     p = exponents.shape[0]
     scale = gram[p]
-    for k in range(1, moments.energy.shape[0]):
+    for k in range(first, last):
         power = moments.power[k]
         for i in range(p):
             d = power[2 * exponents[i, 0], 2 * exponents[i, 1]]
@@ -92,10 +92,9 @@ def residuals_by_degree(moments: Moments, n_range: int, highest: int) -> NDArray
     terms = nested_exponents(min(highest, moments.cross.shape[2] - 1))
     out = np.zeros((moments.energy.shape[0], 2, highest))
 
-    def some(first: int, last: int) -> None:  # the row before the first is passed over
-        part = Moments(*(a[first - 1 : last] for a in moments))
+    def some(first: int, last: int) -> None:
         gram, work = np.empty((len(terms) + 1, len(terms))), np.empty(len(terms))
-        residual_table(part, n_range, terms, gram, work, out[first - 1 : last])
+        residual_table(moments, n_range, terms, first, last, gram, work, out)
 
     over_regions(len(out), len(terms), some)
     return out

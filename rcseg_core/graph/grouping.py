@@ -249,9 +249,7 @@ def _run(graph, state, scratch, gated, limit, merges, heights):  # type: ignore[
             edge = heap.edge[0]
             current = graph.alive[edge] and graph.version[edge] == heap.version[0]
             size -= 1
-            _sift_down(
-                heap, 0, size, heap.value[size], heap.pair[size], heap.edge[size], heap.version[size]
-            )
+            _sift_down(heap, 0, size, heap.value[size], heap.pair[size], heap.edge[size], heap.version[size])
             if not current:
                 continue
             i = graph.ends[edge, 0]

@@ -53,6 +53,13 @@ def tensor_exponents(degree: int) -> NDArray[np.int64]:
     return np.array([[a, b] for a in range(degree + 1) for b in range(degree + 1)], np.int64)
 
 
+@cache
+def model_terms(planes: bool) -> tuple[NDArray[np.int64], ...]:
+    """Exponents of models by degree, 0 to 4; planes : those of first degree have three terms, not four."""
+    first = plane_exponents() if planes else tensor_exponents(1)
+    return (tensor_exponents(0), first, tensor_exponents(2), tensor_exponents(3), tensor_exponents(4))
+
+
 @bare
 def _boxes(labels, first, last, box):  # type: ignore[no-untyped-def]
     """Widen box (N + 1, 4) by the runs of rows first..last-1."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 from rcseg_core.compute.inline import inlined
 from rcseg_core.compute.jit import bare
 from rcseg_core.compute.parallel import over_regions
-from rcseg_core.models.moments import Moments, plane_exponents, solve, tensor_exponents
+from rcseg_core.models.moments import Moments, model_terms, solve
 from rcseg_core.signal.signals import COLOR_OUTLIER, INVALID, RANGE_OUTLIER, local_scales
 from rcseg_core.signal.units import UNIT_PX
 
@@ -30,28 +29,21 @@ class Models(NamedTuple):
 
 
 @bare
-def _fit(moments, degree, first, last, modality, terms, models_degree, coef, gram, flat):  # type: ignore[no-untyped-def]
-    """Fit channels first..last-1 of every region whose models_degree[k, modality] is `degree`."""
-    for k in range(1, moments.energy.shape[0]):
-        if models_degree[k, modality] != degree or moments.power[k, 0, 0] < 1.0:
+def _fit(moments, degree, n_range, terms, begin, end, gram, flat, coef):  # type: ignore[no-untyped-def]
+    """Fit regions begin..end-1; terms[d] : (p, 2) int64, exponents of degree d; gram, flat : scratch."""
+    for k in range(begin, end):
+        if moments.power[k, 0, 0] < 1.0:
             continue
-        solve(moments.power[k], moments.cross[k], first, last, terms, gram, flat)
-        for c in range(first, last):
-            for i in range(terms.shape[0]):
-                coef[k, c, terms[i, 0], terms[i, 1]] = flat[c, i]
-
-
-def _fit_some(
-    moments: Moments, degrees: NDArray[np.int64], degree: int, terms: NDArray[np.int64],
-    span: tuple[int, int, int], coef: NDArray[np.float64], begin: int, end: int,
-) -> None:  # fmt: skip
-    """`_fit` of regions begin..end-1; span : first channel, last channel + 1, modality."""
-    part = Moments(*(sums[begin - 1 : end] for sums in moments))  # the first row is passed over
-    first, last, modality = span
-    size = moments.cross.shape[2] ** 2
-    gram, flat = np.empty((size + 1, size)), np.empty((coef.shape[1], size))
-    degrees, coef = degrees[begin - 1 : end], coef[begin - 1 : end]
-    _fit(part, degree, first, last, modality, terms, degrees, coef, gram, flat)
+        for modality in range(2):
+            first = 0 if modality == 0 else n_range
+            last = n_range if modality == 0 else moments.energy.shape[1]
+            if first == last:
+                continue
+            used = terms[degree[k, modality]]
+            solve(moments.power[k], moments.cross[k], first, last, used, gram, flat)
+            for c in range(first, last):
+                for i in range(used.shape[0]):
+                    coef[k, c, used[i, 0], used[i, 1]] = flat[c, i]
 
 
 def fit_models(moments: Moments, degree: NDArray[np.int64], n_range: int, planes: bool = False) -> Models:
@@ -62,13 +54,19 @@ def fit_models(moments: Moments, degree: NDArray[np.int64], n_range: int, planes
     degree : (N + 1, 2) int64, degree of range and of colour of each region
     planes : first-degree models have three terms (1, x, y) instead of four
     """
-    channels, low = moments.energy.shape[1], moments.cross.shape[2]
-    coef = np.zeros((moments.energy.shape[0], channels, low, low))
-    for modality, (first, last) in enumerate(((0, n_range), (n_range, channels))):
-        for k in sorted(set(degree[1:, modality].tolist())):
-            terms = plane_exponents() if planes and k == 1 else tensor_exponents(k)
-            span = first, last, modality
-            over_regions(len(coef), len(terms), partial(_fit_some, moments, degree, k, terms, span, coef))
+    count, channels = moments.energy.shape
+    low = moments.cross.shape[2]
+    coef = np.zeros((count, channels, low, low))
+    terms = model_terms(planes)
+    size = low * low
+
+    def some(begin: int, end: int) -> None:
+        _fit(
+            moments, degree, n_range, terms, begin, end, np.empty((size + 1, size)),
+            np.empty((channels, size)), coef,
+        )  # fmt: skip
+
+    over_regions(count, size, some)
     return Models(moments.center, degree, coef)
 
 

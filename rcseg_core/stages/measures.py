@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from rcseg_core.config import SegmenterConfig
 from rcseg_core.decision.generalization import choose_degrees, residuals_by_degree
 from rcseg_core.decision.rule import KINDS, Rule, error_budget
-from rcseg_core.models.moments import Moments, plane_exponents, tensor_exponents
+from rcseg_core.models.moments import Moments, model_terms
 from rcseg_core.models.polynomials import Models, fit_models
 from rcseg_core.partition.partition import Partition
 from rcseg_core.signal.signals import Signals, scales
@@ -23,8 +23,6 @@ def make_rule(
     planes : first-degree models have three terms instead of four
     settled : (N + 1,) range degree that each region has earned so far; by default the degree itself
     """
-    first = plane_exponents() if planes else tensor_exponents(1)
-    terms = (tensor_exponents(0), first, tensor_exponents(2), tensor_exponents(3), tensor_exponents(4))
     return Rule(
         kind=KINDS[config.grouping.criterion],
         n_range=signals.n_range,
@@ -40,7 +38,7 @@ def make_rule(
         use_color=use_color and signals.image.shape[2] > signals.n_range,
         earn=True,
         small=config.absorption.small_region * signals.flags.size / (640 * 480),
-        terms=terms,
+        terms=model_terms(planes),
         degree=degree,
         settled=degree[:, 0].copy() if settled is None else np.minimum(settled, degree[:, 0]),
     )
