@@ -137,6 +137,21 @@ def test_refinement_of_a_settled_image_changes_nothing():
     assert np.array_equal(labels, settled)
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_what_refinement_passes_over_would_not_change(seed):
+    """Several passes, which skip what nothing changed beside, are as many passes that look at everything."""
+    signals, labels, _, models = scene(seed)
+    absorb(signals, labels, labels.copy(), models, 1e12)
+    rng = np.random.default_rng(seed)
+    labels[:] = np.where(labels > 0, rng.integers(1, 4, SHAPE), 0)
+    once, leaves = labels.copy(), labels * 10
+    moved = refine(signals, once, once * 10, models, 4)
+    one_by_one = [refine(signals, labels, leaves, models, 1) for _ in range(4)]
+    assert one_by_one[1] > 0
+    assert moved == sum(one_by_one)
+    assert np.array_equal(once, labels)
+
+
 def test_an_image_without_regions_stays_empty():
     signals, labels, _, _ = scene(0)
     labels[:] = 0

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from oracle import naive_graph
 
 from rcseg_core.graph.adjacency import find_pairs, spread
+from rcseg_core.graph.components import mark_borders
 
 
 def random_image(seed, shape=(17, 23), count=5):
@@ -31,6 +32,19 @@ def test_pairs_are_those_of_loops_over_pixels(seed, max_gap):
     assert as_dict(pairs) == naive_graph.pairs(labels, edges, max_gap)
     assert pairs.nodes.tolist() == sorted(pairs.nodes.tolist())
     assert (pairs.nodes[:, 0] < pairs.nodes[:, 1]).all()
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 9), (9, 1), (2, 2), (17, 23)])
+def test_marked_pixels_have_another_label_beside_them_or_end_a_row(shape):
+    labels = random_image(0, shape)[0]
+    wider = np.pad(labels, 1, mode="edge")
+    beside = (wider[:-2, 1:-1], wider[2:, 1:-1], wider[1:-1, :-2], wider[1:-1, 2:])
+    wanted = np.any([labels != other for other in beside], axis=0)
+    wanted[:, [0, -1]] = True
+    marked = np.zeros(shape, np.bool_)
+    for row in range(shape[0]):
+        mark_borders(labels, row, marked[row])
+    assert np.array_equal(marked, wanted)
 
 
 @settings(deadline=None, max_examples=20)

@@ -350,7 +350,10 @@ def test_describe_is_the_same_without_the_compiler(monkeypatch):
         pytest.skip("this run is interpreted already")
     for name in (
         "_basis",
+        "_sum_terms",
+        "_sum_plane",
         "_fit",
+        "_gains",
         "_cost",
         "_costs",
         "_assign",
