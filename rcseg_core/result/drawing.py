@@ -196,7 +196,7 @@ def _titled(title: str, image: Image, width: int) -> Image:
 
 
 def _paint(picture: NDArray[Any], mask: NDArray[np.bool_], color: tuple[int, int, int]) -> Image:
-    """Set the pixels of a mask in place; OpenCV's masked copy is twice as fast as a boolean index."""
-    solid = np.empty_like(picture)
-    solid[:] = color
-    return np.asarray(cv2.copyTo(solid, mask.view(np.uint8), picture), np.uint8)
+    """Set the pixels of a mask in place: they are few, and by number they are found many times sooner."""
+    flat = np.ascontiguousarray(picture).reshape(-1, 3)
+    flat[np.flatnonzero(mask)] = color
+    return np.asarray(flat.reshape(picture.shape), np.uint8)
