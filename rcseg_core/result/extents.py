@@ -41,6 +41,18 @@ class Extents:
 
 
 @bare
+def _add_colors(pixels, total):  # type: ignore[no-untyped-def]
+    red = green = blue = 0
+    for i in range(pixels.shape[0]):
+        red += pixels[i, 0]
+        green += pixels[i, 1]
+        blue += pixels[i, 2]
+    total[0] += red
+    total[1] += green
+    total[2] += blue
+
+
+@bare
 def _sum(labels, color, surface, step, origin, wait, colors, sums):  # type: ignore[no-untyped-def]
     """Colours of all pixels; of every step[k]-th pixel of region k n, x, y, z and xx, xy, xz, yy, yz, zz.
 
@@ -56,14 +68,7 @@ def _sum(labels, color, surface, step, origin, wait, colors, sums):  # type: ign
                 end += 1
             if k <= 0:
                 continue
-            red = green = blue = 0
-            for col in range(start, end):
-                red += color[row, col, 0]
-                green += color[row, col, 1]
-                blue += color[row, col, 2]
-            colors[k, 0] += red
-            colors[k, 1] += green
-            colors[k, 2] += blue
+            _add_colors(color[row, start:end], colors[k])
             col = start + wait[k]
             while col < end:
                 x = surface[row, col, 0] - origin[k, 0]

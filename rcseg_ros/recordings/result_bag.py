@@ -154,8 +154,8 @@ class _QuickMcap(McapWriter):
 
 
 def _compress(pieces: list[Any]) -> bytes:
-    """The pieces as one block, which zstd reads where it lies; a stream it copies first."""
-    return zstandard.ZstdCompressor(level=LEVEL).compress(b"".join(pieces))
+    stream = zstandard.ZstdCompressor(level=LEVEL).compressobj(size=sum(len(piece) for piece in pieces))
+    return b"".join([*(stream.compress(piece) for piece in pieces), stream.flush()])
 
 
 class _QuickWriter(Writer):
