@@ -42,7 +42,7 @@ class Extents:
 
 @bare
 def _add_colors(pixels, total):  # type: ignore[no-untyped-def]
-    red = green = blue = 0
+    red = green = blue = np.int64(0)  # of bytes alone, uncompiled, the sum would be a byte
     for i in range(pixels.shape[0]):
         red += pixels[i, 0]
         green += pixels[i, 1]
