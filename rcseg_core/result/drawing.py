@@ -56,7 +56,7 @@ def labels_picture(labels: NDArray[Any]) -> Image:
     # One 32-bit look-up a pixel instead of three 8-bit ones.
     packed = np.zeros((len(table), 4), np.uint8)
     packed[:, :3] = table
-    rgba = packed.view(np.uint32)[:, 0][labels].view(np.uint8).reshape(*labels.shape, 4)
+    rgba = np.take(packed.view(np.uint32), labels).view(np.uint8).reshape(*labels.shape, 4)
     return np.asarray(cv2.cvtColor(rgba, cv2.COLOR_RGBA2RGB), np.uint8)
 
 
@@ -68,12 +68,13 @@ def boundaries(labels: NDArray[Any]) -> NDArray[np.bool_]:
     """
     edge = np.zeros(labels.shape, bool)
     known = labels != 0
-    hole = ~known
     edge[:, :-1] = (labels[:, 1:] != labels[:, :-1]) & known[:, 1:]
     edge[:-1] |= (labels[1:] != labels[:-1]) & known[1:]
-    edge[:, :-2] |= (labels[:, 2:] != labels[:, :-2]) & hole[:, 1:-1] & known[:, 2:]
-    edge[:-2] |= (labels[2:] != labels[:-2]) & hole[1:-1] & known[2:]
-    edge &= known
+    if not known.all():
+        hole = ~known
+        edge[:, :-2] |= (labels[:, 2:] != labels[:, :-2]) & hole[:, 1:-1] & known[:, 2:]
+        edge[:-2] |= (labels[2:] != labels[:-2]) & hole[1:-1] & known[2:]
+        edge &= known
     return edge
 
 

@@ -92,18 +92,19 @@ def _render(models, labels, n_range, scale, offset, lens, across, first, last, l
                 color[row, start:end] = 0
                 continue
             _along_row(models, k, row, n_range, line)
-            part, center = values[:, start:end], models.center[k, 0]
+            center = models.center[k, 0]
             for c in range(line.shape[0]):
                 degree = models.degree[k, 0 if c < n_range else 1]
-                _values(line[c], degree, start, center, scale[c], offset[c], part[c])
-            _put_colors(part[n_range], part[n_range + 1], part[n_range + 2], color[row, start:end])
+                _values(line[c], degree, start, center, scale[c], offset[c], values[c, start:end])
+            red, green, blue = values[n_range], values[n_range + 1], values[n_range + 2]
+            _put_colors(red[start:end], green[start:end], blue[start:end], color[row, start:end])
             if lens[0] == 0.0:
                 for col in range(start, end):
                     for c in range(3):
                         points[row, col, c] = values[c, col]
                 continue
             down = (row - lens[3]) / lens[1]
-            _put_points(part[0], across[start:end], down, points[row, start:end])
+            _put_points(values[0, start:end], across[start:end], down, points[row, start:end])
 
 
 def render(

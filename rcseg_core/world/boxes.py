@@ -93,23 +93,26 @@ def box_of(scene: Scene, members: Sequence[int], points: Array, up: Up | None) -
     first = square_to(axis)
     frame = np.stack([first, cross(axis, first), axis])
     local = points @ frame.T
-    low, high = _bounds(local)
-    inner = local[((local >= low) & (local <= high)).all(axis=1)]
-    if len(inner) >= 3:
-        angle = np.deg2rad(cv2.minAreaRect(inner[:, :2].astype(np.float32))[2])
+    along = np.ascontiguousarray(local.T)
+    low, high = _bounds(along)
+    inside = ((along >= low[:, None]) & (along <= high[:, None])).all(axis=0)
+    if np.count_nonzero(inside) >= 3:
+        flat = np.stack([along[0, inside], along[1, inside]], axis=1).astype(np.float32)
+        angle = np.deg2rad(cv2.minAreaRect(flat)[2])
         turn = np.array([[np.cos(angle), np.sin(angle), 0], [-np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
         frame = turn @ frame
-        low, high = _bounds(local @ turn.T)
+        low, high = _bounds(np.ascontiguousarray((local @ turn.T).T))
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = frame.T, frame.T @ (0.5 * (low + high))
     return Box3d(pose, high - low)
 
 
-def _bounds(local: Array) -> tuple[Array, Array]:
-    """(3,) each: between these all points (n, 3) lie but a share of `OUTSIDE` at either end."""
-    low = int(OUTSIDE * len(local))
-    high = len(local) - 1 - low
-    ordered = np.partition(np.ascontiguousarray(local.T), (low, high))
+def _bounds(along: Array) -> tuple[Array, Array]:
+    """(3,) each: between these all coordinates (3, n) lie but a share of `OUTSIDE` at either end."""
+    count = along.shape[1]
+    low = int(OUTSIDE * count)
+    high = count - 1 - low
+    ordered = np.partition(along, (low, high))
     return ordered[:, low], ordered[:, high]
 
 
