@@ -18,9 +18,8 @@ import pyarrow as pa
 import shapely
 from numpy.typing import NDArray
 
-from rcseg_core import RangeColorFrame, Region, Surface
+from rcseg_core import BezierPatch, RangeColorFrame, Region, Surface
 from rcseg_core.errors import InputError
-from rcseg_core.models.bezier import BezierPatch
 from rcseg_core.result.seen import region_areas
 from rcseg_core.tracking import KINDS
 from rcseg_core.world import Object, World
@@ -90,7 +89,7 @@ def encode_label_image(labels: NDArray[np.int32]) -> bytes:
     if labels.max(initial=0) > 0xFFFF:
         raise InputError(f"{labels.max()} labels do not fit into 16 bits; coarsen the segmentation")
     height, width = labels.shape
-    pixels = labels.astype(">u2").view(np.uint8)
+    pixels = labels.astype(">u2", order="C").view(np.uint8)
     rows = np.empty((height, 1 + 2 * width), np.uint8)
     rows[:, 0], rows[0, 1:] = _UP, pixels[0]
     np.subtract(pixels[1:], pixels[:-1], out=rows[1:, 1:])
