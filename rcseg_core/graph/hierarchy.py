@@ -122,9 +122,13 @@ def _record(merges, heights, nodes, node_heights, first_node, children, new_heig
 def _mark_members(labels, leaves, last, marks):  # type: ignore[no-untyped-def]
     """marks[label, leaf] for all pairs that occur; last (L + 1,) int64 zeros: scratch."""
     for row in range(labels.shape[0]):
+        before = leaf_before = -1
         for col in range(labels.shape[1]):
             label = labels[row, col]
             leaf = leaves[row, col]
+            if label == before and leaf == leaf_before:
+                continue
+            before, leaf_before = label, leaf
             if label > 0 and last[leaf] != label:
                 last[leaf] = label
                 marks[label, leaf] = True

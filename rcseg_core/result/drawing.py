@@ -56,7 +56,7 @@ def labels_picture(labels: NDArray[Any]) -> Image:
     # One 32-bit look-up a pixel instead of three 8-bit ones.
     packed = np.zeros((len(table), 4), np.uint8)
     packed[:, :3] = table
-    rgba = packed.view(np.uint32)[:, 0][labels].view(np.uint8).reshape(*labels.shape, 4)
+    rgba = np.take(packed.view(np.uint32), labels).view(np.uint8).reshape(*labels.shape, 4)
     return np.asarray(cv2.cvtColor(rgba, cv2.COLOR_RGBA2RGB), np.uint8)
 
 
@@ -68,12 +68,13 @@ def boundaries(labels: NDArray[Any]) -> NDArray[np.bool_]:
     """
     edge = np.zeros(labels.shape, bool)
     known = labels != 0
-    hole = ~known
     edge[:, :-1] = (labels[:, 1:] != labels[:, :-1]) & known[:, 1:]
     edge[:-1] |= (labels[1:] != labels[:-1]) & known[1:]
-    edge[:, :-2] |= (labels[:, 2:] != labels[:, :-2]) & hole[:, 1:-1] & known[:, 2:]
-    edge[:-2] |= (labels[2:] != labels[:-2]) & hole[1:-1] & known[2:]
-    edge &= known
+    if not known.all():
+        hole = ~known
+        edge[:, :-2] |= (labels[:, 2:] != labels[:, :-2]) & hole[:, 1:-1] & known[:, 2:]
+        edge[:-2] |= (labels[2:] != labels[:-2]) & hole[1:-1] & known[2:]
+        edge &= known
     return edge
 
 
@@ -196,7 +197,7 @@ def _titled(title: str, image: Image, width: int) -> Image:
 
 
 def _paint(picture: NDArray[Any], mask: NDArray[np.bool_], color: tuple[int, int, int]) -> Image:
-    """Set the pixels of a mask in place; OpenCV's masked copy is twice as fast as a boolean index."""
-    solid = np.empty_like(picture)
-    solid[:] = color
-    return np.asarray(cv2.copyTo(solid, mask.view(np.uint8), picture), np.uint8)
+    """Set the pixels of a mask in place: they are few, and by number they are found many times sooner."""
+    flat = np.ascontiguousarray(picture).reshape(-1, 3)
+    flat[np.flatnonzero(mask)] = color
+    return np.asarray(flat.reshape(picture.shape), np.uint8)

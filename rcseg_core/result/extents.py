@@ -41,6 +41,18 @@ class Extents:
 
 
 @bare
+def _add_colors(pixels, total):  # type: ignore[no-untyped-def]
+    red = green = blue = np.int64(0)  # of bytes alone, uncompiled, the sum would be a byte
+    for i in range(pixels.shape[0]):
+        red += pixels[i, 0]
+        green += pixels[i, 1]
+        blue += pixels[i, 2]
+    total[0] += red
+    total[1] += green
+    total[2] += blue
+
+
+@bare
 def _sum(labels, color, surface, step, origin, wait, colors, sums):  # type: ignore[no-untyped-def]
     """Colours of all pixels; of every step[k]-th pixel of region k n, x, y, z and xx, xy, xz, yy, yz, zz.
 
@@ -49,31 +61,33 @@ def _sum(labels, color, surface, step, origin, wait, colors, sums):  # type: ign
     """
     height, width = labels.shape
     for row in range(height):
-        for col in range(width):
-            k = labels[row, col]
+        end = 0
+        while end < width:
+            start, k = end, labels[row, end]
+            while end < width and labels[row, end] == k:
+                end += 1
             if k <= 0:
                 continue
-            for c in range(3):
-                colors[k, c] += color[row, col, c]
-            wait[k] -= 1
-            if wait[k] >= 0:
-                continue
-            wait[k] = step[k] - 1
-            x = surface[row, col, 0] - origin[k, 0]
-            y = surface[row, col, 1] - origin[k, 1]
-            z = surface[row, col, 2] - origin[k, 2]
-            if not np.isfinite(x + y + z):
-                continue
-            sums[k, 0] += 1.0
-            sums[k, 1] += x
-            sums[k, 2] += y
-            sums[k, 3] += z
-            sums[k, 4] += x * x
-            sums[k, 5] += x * y
-            sums[k, 6] += x * z
-            sums[k, 7] += y * y
-            sums[k, 8] += y * z
-            sums[k, 9] += z * z
+            _add_colors(color[row, start:end], colors[k])
+            col = start + wait[k]
+            while col < end:
+                x = surface[row, col, 0] - origin[k, 0]
+                y = surface[row, col, 1] - origin[k, 1]
+                z = surface[row, col, 2] - origin[k, 2]
+                col += step[k]
+                if not np.isfinite(x + y + z):
+                    continue
+                sums[k, 0] += 1.0
+                sums[k, 1] += x
+                sums[k, 2] += y
+                sums[k, 3] += z
+                sums[k, 4] += x * x
+                sums[k, 5] += x * y
+                sums[k, 6] += x * z
+                sums[k, 7] += y * y
+                sums[k, 8] += y * z
+                sums[k, 9] += z * z
+            wait[k] = col - end
 
 
 @bare
@@ -81,23 +95,26 @@ def _ends(labels, surface, step, middle, axes, wait, low, high):  # type: ignore
     """Least and greatest coordinate along the axes of the points that `_sum` counted."""
     height, width = labels.shape
     for row in range(height):
-        for col in range(width):
-            k = labels[row, col]
+        end = 0
+        while end < width:
+            start, k = end, labels[row, end]
+            while end < width and labels[row, end] == k:
+                end += 1
             if k <= 0:
                 continue
-            wait[k] -= 1
-            if wait[k] >= 0:
-                continue
-            wait[k] = step[k] - 1
-            x = surface[row, col, 0] - middle[k, 0]
-            y = surface[row, col, 1] - middle[k, 1]
-            z = surface[row, col, 2] - middle[k, 2]
-            if not np.isfinite(x + y + z):
-                continue
-            for a in range(3):
-                along = x * axes[k, 0, a] + y * axes[k, 1, a] + z * axes[k, 2, a]
-                low[k, a] = min(low[k, a], along)
-                high[k, a] = max(high[k, a], along)
+            col = start + wait[k]
+            while col < end:
+                x = surface[row, col, 0] - middle[k, 0]
+                y = surface[row, col, 1] - middle[k, 1]
+                z = surface[row, col, 2] - middle[k, 2]
+                col += step[k]
+                if not np.isfinite(x + y + z):
+                    continue
+                for a in range(3):
+                    along = x * axes[k, 0, a] + y * axes[k, 1, a] + z * axes[k, 2, a]
+                    low[k, a] = min(low[k, a], along)
+                    high[k, a] = max(high[k, a], along)
+            wait[k] = col - end
 
 
 def region_extents(

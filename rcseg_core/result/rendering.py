@@ -31,36 +31,52 @@ def _along_row(models, k, row, n_range, line):  # type: ignore[no-untyped-def]
 
 
 @bare
-def _values(models, k, n_range, scale, offset, line, start, end, values):  # type: ignore[no-untyped-def]
-    """values[c, col] of columns start..end-1 of one row, in sensor units; planes and quadrics by loops that
-    the compiler can do several columns at a time."""
-    center = models.center[k, 0]
-    for c in range(line.shape[0]):
-        degree = models.degree[k, 0 if c < n_range else 1]
-        size, shift = scale[c], offset[c]
-        if degree == 1:
-            a0, a1 = line[c, 0], line[c, 1]
-            for col in range(start, end):
-                values[c, col] = ((col - center) / UNIT_PX * a1 + a0) * size + shift
-        elif degree == 2:
-            a0, a1, a2 = line[c, 0], line[c, 1], line[c, 2]
-            for col in range(start, end):
-                x = (col - center) / UNIT_PX
-                values[c, col] = ((x * a2 + a1) * x + a0) * size + shift
-        else:
-            for col in range(start, end):
-                x = (col - center) / UNIT_PX
-                value = 0.0
-                for a in range(degree, -1, -1):
-                    value = value * x + line[c, a]
-                values[c, col] = value * size + shift
+def _values(line, degree, start, center, size, shift, out):  # type: ignore[no-untyped-def]
+    """out (n,): one channel of columns from start on, in sensor units; planes and quadrics by loops that the
+    compiler can do several columns at a time."""
+    if degree == 1:
+        a0, a1 = line[0], line[1]
+        for i in range(out.size):
+            out[i] = ((start + i - center) / UNIT_PX * a1 + a0) * size + shift
+    elif degree == 2:
+        a0, a1, a2 = line[0], line[1], line[2]
+        for i in range(out.size):
+            x = (start + i - center) / UNIT_PX
+            out[i] = ((x * a2 + a1) * x + a0) * size + shift
+    else:
+        for i in range(out.size):
+            x = (start + i - center) / UNIT_PX
+            value = 0.0
+            for a in range(degree, -1, -1):
+                value = value * x + line[a]
+            out[i] = value * size + shift
 
 
 @bare
-def _render(models, labels, n_range, scale, offset, lens, first, last, line, values, points, color):  # type: ignore[no-untyped-def]
+def _put_colors(red, green, blue, out):  # type: ignore[no-untyped-def]
+    for i in range(red.size):
+        out[i, 0] = np.uint8(min(max(np.rint(red[i]), 0.0), 255.0))
+        out[i, 1] = np.uint8(min(max(np.rint(green[i]), 0.0), 255.0))
+        out[i, 2] = np.uint8(min(max(np.rint(blue[i]), 0.0), 255.0))
+
+
+@bare
+def _put_points(inverse, across, down, out):  # type: ignore[no-untyped-def]
+    """Points (n, 3) of inverse depths (n,), which become depths; across (n,), down: x and y over depth."""
+    for i in range(inverse.size):
+        inverse[i] = 1.0 / inverse[i] if inverse[i] > 0.0 else np.nan
+    for i in range(inverse.size):
+        depth = inverse[i]
+        out[i, 0] = across[i] * depth
+        out[i, 1] = down * depth
+        out[i, 2] = depth
+
+
+@bare
+def _render(models, labels, n_range, scale, offset, lens, across, first, last, line, values, points, color):  # type: ignore[no-untyped-def]
     """Fill rows first..last-1 of points and color, run by run of a label.
 
-    lens : (fx, fy, cx, cy) where range channel 0 is inverse depth, else fx = 0
+    lens : (fx, fy, cx, cy) where range channel 0 is inverse depth, else fx = 0; across : (W,) x over depth
     line : (C, D + 1) scratch; values : (C, W) scratch
     """
     width = labels.shape[1]
@@ -76,22 +92,19 @@ def _render(models, labels, n_range, scale, offset, lens, first, last, line, val
                 color[row, start:end] = 0
                 continue
             _along_row(models, k, row, n_range, line)
-            _values(models, k, n_range, scale, offset, line, start, end, values)
-            for col in range(start, end):
-                for c in range(3):
-                    color[row, col, c] = np.uint8(min(max(np.rint(values[n_range + c, col]), 0.0), 255.0))
+            center = models.center[k, 0]
+            for c in range(line.shape[0]):
+                degree = models.degree[k, 0 if c < n_range else 1]
+                _values(line[c], degree, start, center, scale[c], offset[c], values[c, start:end])
+            red, green, blue = values[n_range], values[n_range + 1], values[n_range + 2]
+            _put_colors(red[start:end], green[start:end], blue[start:end], color[row, start:end])
             if lens[0] == 0.0:
                 for col in range(start, end):
                     for c in range(3):
                         points[row, col, c] = values[c, col]
                 continue
-            y = (row - lens[3]) / lens[1]
-            for col in range(start, end):
-                value = values[0, col]
-                depth = 1.0 / value if value > 0.0 else np.nan
-                points[row, col, 0] = (col - lens[2]) / lens[0] * depth
-                points[row, col, 1] = y * depth
-                points[row, col, 2] = depth
+            down = (row - lens[3]) / lens[1]
+            _put_points(values[0, start:end], across[start:end], down, points[row, start:end])
 
 
 def render(
@@ -115,6 +128,7 @@ def render(
     if signals.inverse_depth:
         assert camera is not None
         lens[:] = camera.fx, camera.fy, camera.cx, camera.cy
+    across = (np.arange(labels.shape[1]) - lens[2]) / (lens[0] or 1.0)
     points = np.empty((*labels.shape, 3), np.float32)
     color = np.empty((*labels.shape, 3), np.uint8)
     line = np.empty((BANDS, channels, models.coef.shape[2]))
@@ -122,8 +136,8 @@ def render(
 
     def render_band(i: int, first: int, last: int) -> None:
         _render(
-            models, labels, signals.n_range, signals.scale, signals.offset, lens, first, last, line[i],
-            values[i], points, color,
+            models, labels, signals.n_range, signals.scale, signals.offset, lens, across, first, last,
+            line[i], values[i], points, color,
         )  # fmt: skip
 
     over_bands(labels.shape[0], render_band)

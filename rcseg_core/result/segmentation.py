@@ -20,7 +20,7 @@ from rcseg_core.models.bezier import BezierPatch
 from rcseg_core.models.polynomials import Models
 from rcseg_core.result.rendering import render
 from rcseg_core.shapes.cells import gather_cells
-from rcseg_core.shapes.local_forms import LocalCylinder, LocalSphere, local_form
+from rcseg_core.shapes.local_forms import LocalCylinder, LocalSphere, local_forms
 from rcseg_core.shapes.plane_forms import LocalPlane
 from rcseg_core.shapes.primitives import Primitive, recognise
 from rcseg_core.signal.noise import NoiseModel
@@ -234,14 +234,14 @@ class Segmentation:
         parts: list[list[Region]] = [[] for _ in range(len(cells) + 1)]
         for region in self.regions:
             parts[region.surface].append(region)
+        recognised = [recognise(part) for part in cells]
+        forms = local_forms([found for found, _ in recognised], cells, self.noise)
         surfaces = []
-        for s, part in enumerate(cells, start=1):
+        for s, ((found, candidates), form) in enumerate(zip(recognised, forms, strict=True), start=1):
             rows_0, cols_0, rows_1, cols_1 = zip(*(region.box for region in parts[s]), strict=True)
             box = min(rows_0), min(cols_0), max(rows_1), max(cols_1)
-            pixels = sum(region.pixel_count for region in parts[s])
-            found, candidates = recognise(part)
-            local, labels = local_form(found, part, self.noise), tuple(r.label for r in parts[s])
-            surfaces.append(Surface(s, pixels, box, labels, found, candidates, local))
+            pixels, labels = sum(r.pixel_count for r in parts[s]), tuple(r.label for r in parts[s])
+            surfaces.append(Surface(s, pixels, box, labels, found, candidates, form))
         return surfaces
 
     @cached_property

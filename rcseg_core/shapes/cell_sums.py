@@ -50,6 +50,17 @@ def mark_rims(surfaces, margin, rim):  # type: ignore[no-untyped-def]
 
 
 @bare
+def _count_usable(flags, rim):  # type: ignore[no-untyped-def]
+    """Usable pixels of a run, and those of them off the rim; without a branch, several at a time."""
+    usable, inner = 0, 0
+    for i in range(flags.size):
+        good = (flags[i] & UNUSABLE) == 0
+        usable += good
+        inner += good & (not rim[i])
+    return usable, inner
+
+
+@bare
 def measure_extent(labels, surfaces, rim, flags, degree, count, core, bent, box):  # type: ignore[no-untyped-def]
     """Usable pixels of each surface, those off its rim, whether a patch of it has a degree (N + 1,) above 1,
     and its box (row_min, col_min, row_max, col_max)."""
@@ -62,16 +73,14 @@ def measure_extent(labels, surfaces, rim, flags, degree, count, core, bent, box)
                 end += 1
             if s <= 0:
                 continue
-            usable, inner, first, last = 0, 0, width, -1
-            for col in range(start, end):
-                if flags[row, col] & UNUSABLE:
-                    continue
-                usable += 1
-                inner += not rim[row, col]
-                first = min(first, col)
-                last = col
+            usable, inner = _count_usable(flags[row, start:end], rim[row, start:end])
             if usable == 0:
                 continue
+            first, last = start, end - 1
+            while flags[row, first] & UNUSABLE:
+                first += 1
+            while flags[row, last] & UNUSABLE:
+                last -= 1
             count[s] += usable
             core[s] += inner
             bent[s] |= degree[k] > 1

@@ -9,6 +9,7 @@ sags by sigma at the rim and changes the radius. Half extents are those of an ev
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -77,25 +78,33 @@ def depth_bias(noise: NoiseModel, point: Array) -> float:
     return float((a + w * (b + w * c)) / w**2)
 
 
-def local_form(
-    found: Primitive, cells: Cells, noise: NoiseModel
-) -> LocalPlane | LocalSphere | LocalCylinder | None:
-    """A recognised shape in minimal local form; None where none was recognised.
+def local_forms(
+    found: Sequence[Primitive], cells: Sequence[Cells], noise: NoiseModel
+) -> list[LocalPlane | LocalSphere | LocalCylinder | None]:
+    """Recognised shapes in minimal local form; None where none was recognised.
 
     Parameters
     ----------
-    found, cells : the shape, and the measurements that it was found in
+    found, cells : the shape of each surface, and the measurements that it was found in
     noise : what is systematic is taken from it, see `depth_bias`
     """
-    if found.kind == "none":
-        return None
-    middle = _middle(cells)
-    bias = depth_bias(noise, middle)
-    if found.kind == "plane":
-        return local_plane(found, cells.points, cells.pixels, bias)
-    if found.kind == "sphere":
-        return local_sphere(found, cells.points, cells.pixels, bias)
-    return local_cylinder(found, cells.points, cells.pixels, bias)
+    biases = [
+        0.0 if one.kind == "none" else depth_bias(noise, _middle(part))
+        for one, part in zip(found, cells, strict=True)
+    ]
+    flat = [i for i, one in enumerate(found) if one.kind == "plane"]
+    surfaces = [(cells[i].points, cells[i].pixels) for i in flat]
+    forms: list[LocalPlane | LocalSphere | LocalCylinder | None] = [None] * len(found)
+    for i, plane in zip(
+        flat, _local_planes([found[i] for i in flat], surfaces, [biases[i] for i in flat]), strict=True
+    ):
+        forms[i] = plane
+    for i, (one, part) in enumerate(zip(found, cells, strict=True)):
+        if one.kind == "sphere":
+            forms[i] = local_sphere(one, part.points, part.pixels, biases[i])
+        elif one.kind == "cylinder":
+            forms[i] = local_cylinder(one, part.points, part.pixels, biases[i])
+    return forms
 
 
 def local_plane(
@@ -109,27 +118,47 @@ def local_plane(
     points, weight : (m, 3) m and (m,), the surface; its centroid and longest spread are theirs
     systematic_sigma_m : one sigma of the systematic error of depth at the centroid, m
     """
-    normal = np.asarray(found.parameters["normal"], np.float64)
-    origin, spread = spread_of(points, weight)
-    origin = origin + (found.parameters["distance"] - normal @ origin) * normal
-    onto: Array = np.eye(3) - normal[:, None] * normal
+    return _local_planes([found], [(points, weight)], [systematic_sigma_m])[0]
+
+
+def _local_planes(
+    found: Sequence[Primitive], surfaces: Sequence[tuple[Array, Array]], sigmas_m: Sequence[float]
+) -> list[LocalPlane]:
+    """`local_plane` of n planes at once: each costs some thirty calls for a few numbers."""
+    if not found:
+        return []
+    normal = np.array([one.parameters["normal"] for one in found], np.float64)
+    distance = np.array([float(one.parameters["distance"]) for one in found])
+    spreads = [spread_of(points, weight) for points, weight in surfaces]
+    origin, spread = np.array([one[0] for one in spreads]), np.array([one[1] for one in spreads])
+    origin = origin + (distance - _dot(normal, origin))[:, None] * normal
+    onto: Array = np.eye(3) - normal[:, :, None] * normal[:, None]
     spread = onto @ spread @ onto
-    x = _signed(np.linalg.eigh(spread)[1][:, 2])
-    x = x - (x @ normal) * normal
-    x /= np.linalg.norm(x)
-    y = cross(normal, x)
-    pose = _pose(x, y, normal, origin)
+    x = np.linalg.eigh(spread)[1][:, :, 2]
+    largest = np.take_along_axis(x, np.abs(x).argmax(axis=1)[:, None], axis=1)
+    x = np.where(largest > 0, x, -x)
+    x = x - _dot(x, normal)[:, None] * normal
+    x /= np.sqrt(_dot(x, x))[:, None]
+    y = np.cross(normal, x)
+    pose = np.tile(np.eye(4), (len(found), 1, 1))
+    pose[:, :3] = np.stack([x, y, normal, origin], axis=2)
     # a turn about x moves the normal by -y, one about y by x; an offset is what is left at the centroid
-    table = np.zeros((3, 4))
-    table[0, :3], table[1, :3], table[2, :3], table[2, 3] = -y, x, -origin, 1.0
-    shift = systematic_sigma_m * abs(float(normal @ origin)) / max(abs(float(origin[2])), 1e-12)
-    systematic = np.zeros((3, 3))
-    systematic[0, 0] = (
-        shift / max(np.sqrt(3.0 * max(float(y @ spread @ y), 0.0)), 1e-9)
-    ) ** 2  # half extents
-    systematic[1, 1] = (shift / max(np.sqrt(3.0 * max(float(x @ spread @ x), 0.0)), 1e-9)) ** 2
-    systematic[2, 2] = shift**2
-    return LocalPlane(pose, table @ found.covariance @ table.T, systematic)
+    table = np.zeros((len(found), 3, 4))
+    table[:, 0, :3], table[:, 1, :3], table[:, 2, :3], table[:, 2, 3] = -y, x, -origin, 1.0
+    covariance = table @ np.array([one.covariance for one in found]) @ table.swapaxes(1, 2)
+    ahead = np.maximum(np.abs(origin[:, 2]), 1e-12)
+    shift = np.array(sigmas_m) * np.abs(_dot(normal, origin)) / ahead
+    systematic = np.zeros((len(found), 3, 3))
+    for i, axis in enumerate((y, x)):  # half extents
+        along = _dot(axis, (spread @ axis[:, :, None])[:, :, 0])
+        systematic[:, i, i] = (shift / np.maximum(np.sqrt(3.0 * np.maximum(along, 0.0)), 1e-9)) ** 2
+    systematic[:, 2, 2] = shift**2
+    return [LocalPlane(*parts) for parts in zip(pose, covariance, systematic, strict=True)]
+
+
+def _dot(a: Array, b: Array) -> Array:
+    """(n,) products of vectors (n, 3)."""
+    return np.asarray(np.einsum("ni,ni->n", a, b))
 
 
 def local_sphere(
@@ -184,11 +213,6 @@ def local_cylinder(
 
 def _middle(cells: Cells) -> Array:
     return np.asarray(cells.pixels @ cells.points / cells.pixels.sum())
-
-
-def _signed(vector: Array) -> Array:
-    """The vector or its opposite, its largest component positive."""
-    return vector if vector[int(np.argmax(np.abs(vector)))] > 0 else -vector
 
 
 def _square_to(axis: Array) -> tuple[Array, Array]:

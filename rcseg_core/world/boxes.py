@@ -29,20 +29,30 @@ ENOUGH = 1500
 
 
 @bare
-def _gather(points, flags, objects, sound, steps, seen, wait, first, out):  # type: ignore[no-untyped-def]
-    """Every steps[k]-th measured pixel of object k into out, from row first[k] on; seen (K + 1,) counts
+def _gather(flags, objects, sound, steps, seen, wait, first, rows, cols):  # type: ignore[no-untyped-def]
+    """Every steps[k]-th measured pixel of object k into rows and cols, from first[k] on; seen (K + 1,) counts
     them, wait (K + 1,) those until the next that is taken."""
-    for row in range(objects.shape[0]):
-        for col in range(objects.shape[1]):
-            k = objects[row, col]
-            if k <= 0 or flags[row, col] & INVALID or (sound[k] and flags[row, col] & UNUSABLE):
+    height, width = objects.shape
+    for row in range(height):
+        end = 0
+        while end < width:
+            start, k = end, objects[row, end]
+            while end < width and objects[row, end] == k:
+                end += 1
+            if k <= 0:
                 continue
-            if wait[k] == 0:
-                wait[k] = steps[k]
-                for c in range(3):
-                    out[first[k] + seen[k], c] = points[row, col, c]
-                seen[k] += 1
-            wait[k] -= 1
+            left_out = UNUSABLE if sound[k] else INVALID
+            step, waiting, at = steps[k], wait[k], first[k] + seen[k]
+            for col in range(start, end):
+                if flags[row, col] & left_out:
+                    continue
+                if waiting == 0:
+                    waiting = step
+                    rows[at] = row
+                    cols[at] = col
+                    at += 1
+                waiting -= 1
+            wait[k], seen[k] = waiting, at - first[k]
 
 
 @bare
@@ -50,8 +60,9 @@ def _find_sound(flags, objects, sound):  # type: ignore[no-untyped-def]
     """sound (K + 1,): whether an object has a pixel that is no outlier."""
     for row in range(objects.shape[0]):
         for col in range(objects.shape[1]):
-            if flags[row, col] & UNUSABLE == 0:
-                sound[objects[row, col]] = True
+            k = objects[row, col]
+            if k > 0 and not sound[k]:
+                sound[k] = flags[row, col] & UNUSABLE == 0
 
 
 def points_of(scene: Scene, objects: NDArray[np.int32], sizes: NDArray[np.int64]) -> list[Array]:
@@ -68,9 +79,11 @@ def points_of(scene: Scene, objects: NDArray[np.int32], sizes: NDArray[np.int64]
     room = sizes // steps + 1
     room[0] = 0
     first = np.concatenate([[0], np.cumsum(room)])
-    taken, wait, out = np.zeros(count, np.int64), np.zeros(count, np.int64), np.empty((first[-1], 3))
-    _gather(scene.points, flags, objects, sound, steps, taken, wait, first, out)
-    return [out[first[k] : first[k] + taken[k]] if taken[k] else np.zeros((1, 3)) for k in range(count)]
+    taken, wait = np.zeros(count, np.int64), np.zeros(count, np.int64)
+    rows, cols = np.zeros(first[-1], np.int64), np.zeros(first[-1], np.int64)
+    _gather(flags, objects, sound, steps, taken, wait, first, rows, cols)
+    points = scene.points_at(rows, cols).astype(np.float64)
+    return [points[first[k] : first[k] + taken[k]] if taken[k] else np.zeros((1, 3)) for k in range(count)]
 
 
 def box_of(scene: Scene, members: Sequence[int], points: Array, up: Up | None) -> Box3d:
@@ -80,24 +93,27 @@ def box_of(scene: Scene, members: Sequence[int], points: Array, up: Up | None) -
     first = square_to(axis)
     frame = np.stack([first, cross(axis, first), axis])
     local = points @ frame.T
-    low, high = _bounds(local)
-    inner = local[((local >= low) & (local <= high)).all(axis=1)]
-    if len(inner) >= 3:
-        angle = np.deg2rad(cv2.minAreaRect(inner[:, :2].astype(np.float32))[2])
+    along = np.ascontiguousarray(local.T)
+    low, high = _bounds(along)
+    inside = ((along >= low[:, None]) & (along <= high[:, None])).all(axis=0)
+    if np.count_nonzero(inside) >= 3:
+        flat = np.stack([along[0, inside], along[1, inside]], axis=1).astype(np.float32)
+        angle = np.deg2rad(cv2.minAreaRect(flat)[2])
         turn = np.array([[np.cos(angle), np.sin(angle), 0], [-np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
         frame = turn @ frame
-        low, high = _bounds(local @ turn.T)
+        low, high = _bounds(np.ascontiguousarray((local @ turn.T).T))
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = frame.T, frame.T @ (0.5 * (low + high))
     return Box3d(pose, high - low)
 
 
-def _bounds(local: Array) -> tuple[Array, Array]:
-    """(3,) each: between these all points (n, 3) lie but a share of `OUTSIDE` at either end."""
-    low = int(OUTSIDE * len(local))
-    high = len(local) - 1 - low
-    ordered = np.partition(local, (low, high), axis=0)
-    return ordered[low], ordered[high]
+def _bounds(along: Array) -> tuple[Array, Array]:
+    """(3,) each: between these all coordinates (3, n) lie but a share of `OUTSIDE` at either end."""
+    count = along.shape[1]
+    low = int(OUTSIDE * count)
+    high = count - 1 - low
+    ordered = np.partition(along, (low, high))
+    return ordered[:, low], ordered[:, high]
 
 
 def _axis(scene: Scene, members: Sequence[int], up: Up | None) -> Array:
@@ -111,7 +127,33 @@ def _axis(scene: Scene, members: Sequence[int], up: Up | None) -> Array:
     return np.array([0.0, -1.0, 0.0])
 
 
-def stands_on(scene: Scene, members: Sequence[int], points: Array, up: Up | None, links: Links) -> int:
+class Borders:
+    """Links by the objects on either side of them.
+
+    Parameters
+    ----------
+    objects : (M + 1,) the object of each surface
+    """
+
+    def __init__(self, links: Links, objects: NDArray[np.int32]) -> None:
+        self._surfaces, self._objects = links.surfaces, objects[links.surfaces]
+        away = np.sqrt(np.einsum("nsi,nsi->ns", links.edge, links.edge))
+        self._meets = links.apart[:, None] <= MEETS * away
+
+    def of(self, label: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Surfaces of others that border on an object, ascending, and the links at which each of them meets
+        it."""
+        sides = self._objects == label
+        at = np.flatnonzero(sides[:, 0] != sides[:, 1])
+        own = sides[at, 1].astype(int)
+        other = self._surfaces[at, 1 - own]
+        count = np.bincount(other)
+        meeting = np.bincount(other[self._meets[at, own]], minlength=len(count))
+        found = np.flatnonzero(count)
+        return found, meeting[found]
+
+
+def stands_on(scene: Scene, label: int, points: Array, up: Up | None, borders: Borders) -> int:
     """Label of the surface below an object; 0 where up is unknown or none is seen.
 
     Of the surfaces of others that face up, border on it and lie below its middle: the one that it meets along
@@ -119,22 +161,15 @@ def stands_on(scene: Scene, members: Sequence[int], points: Array, up: Up | None
     """
     if up is None:
         return 0
-    inside = np.zeros(len(scene.surfaces) + 1, np.bool_)
-    inside[list(members)] = True
-    sides = inside[links.surfaces]
-    border = np.flatnonzero(sides[:, 0] != sides[:, 1])
-    own = sides[border, 1].astype(int)
-    other = links.surfaces[border, 1 - own]
-    near = links.apart[border] <= MEETS * np.linalg.norm(links.edge[border, own], axis=1)
     middle, below = points.mean(axis=0), []
     foot = middle + quantile((points - middle) @ up.vector, 0.02) * up.vector
-    for s in np.unique(other):
+    for s, meeting in zip(*(column.tolist() for column in borders.of(label)), strict=True):
         plane = scene.planes[s - 1]
         if plane is None or plane.normal @ up.vector < FACES_UP:
             continue
         height = (middle @ plane.normal - plane.distance, foot @ plane.normal - plane.distance)
         if height[0] > 0.0 and height[1] < height[0]:
-            below.append((-int(near[other == s].sum()), height[1], int(s)))
+            below.append((-meeting, height[1], s))
     if not below:
         return 0
     meeting, gap, best = min(below)

@@ -91,45 +91,38 @@ def _find(surfaces, gap, out):  # type: ignore[no-untyped-def]
 
 
 @bare
-def _point(models, k, row, col, n_range, scale, offset, lens, out):  # type: ignore[no-untyped-def]
-    """The model of region k at a pixel, m; lens : (fx, fy, cx, cy), fx = 0 where channels are x, y, z."""
+def _point(models, k, row, col, scale, offset, lens):  # type: ignore[no-untyped-def]
+    """x, y, z of the model of region k at a pixel, m: numbers, since those of an array would leave registers.
+
+    lens : (fx, fy, cx, cy), fx = 0 where channels are x, y, z
+    """
+    first = predict(models, k, row, col, 0, 0) * scale[0] + offset[0]
     if lens[0] == 0.0:
-        for c in range(n_range):
-            out[c] = predict(models, k, row, col, 0, c) * scale[c] + offset[c]
-        return
-    inverse = predict(models, k, row, col, 0, 0) * scale[0] + offset[0]
-    depth = 1.0 / inverse if inverse > 0.0 else np.nan
-    out[0] = (col - lens[2]) / lens[0] * depth
-    out[1] = (row - lens[3]) / lens[1] * depth
-    out[2] = depth
+        second = predict(models, k, row, col, 0, 1) * scale[1] + offset[1]
+        return first, second, predict(models, k, row, col, 0, 2) * scale[2] + offset[2]
+    depth = 1.0 / first if first > 0.0 else np.nan
+    return (col - lens[2]) / lens[0] * depth, (row - lens[3]) / lens[1] * depth, depth
 
 
 @bare
-def _normal(models, k, row, col, n_range, scale, offset, lens, scratch, out):  # type: ignore[no-untyped-def]
+def _normal(models, k, row, col, scale, offset, lens, out):  # type: ignore[no-untyped-def]
     """Unit normal of the model of region k at a pixel, towards the sensor."""
-    _point(models, k, row, col - STEP_PX, n_range, scale, offset, lens, scratch[0])
-    _point(models, k, row, col + STEP_PX, n_range, scale, offset, lens, scratch[1])
-    _point(models, k, row - STEP_PX, col, n_range, scale, offset, lens, scratch[2])
-    _point(models, k, row + STEP_PX, col, n_range, scale, offset, lens, scratch[3])
-    length = 0.0
-    toward = 0.0
-    for i in range(3):
-        a = (i + 1) % 3
-        b = (i + 2) % 3
-        out[i] = (scratch[1, a] - scratch[0, a]) * (scratch[3, b] - scratch[2, b]) - (
-            scratch[1, b] - scratch[0, b]
-        ) * (scratch[3, a] - scratch[2, a])
-        length += out[i] * out[i]
-        toward -= out[i] * scratch[0, i]
-    if lens[0] == 0.0:
-        toward = -out[2]
-    length = np.sqrt(length)
-    for i in range(3):
-        out[i] /= length if toward >= 0.0 else -length
+    left_x, left_y, left_z = _point(models, k, row, col - STEP_PX, scale, offset, lens)
+    x, y, z = _point(models, k, row, col + STEP_PX, scale, offset, lens)
+    ux, uy, uz = x - left_x, y - left_y, z - left_z
+    top_x, top_y, top_z = _point(models, k, row - STEP_PX, col, scale, offset, lens)
+    x, y, z = _point(models, k, row + STEP_PX, col, scale, offset, lens)
+    vx, vy, vz = x - top_x, y - top_y, z - top_z
+    nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+    toward = -nz if lens[0] == 0.0 else -(nx * left_x + ny * left_y + nz * left_z)
+    length = np.sqrt(nx * nx + ny * ny + nz * nz)
+    if not toward >= 0.0:
+        length = -length
+    out[0], out[1], out[2] = nx / length, ny / length, nz / length
 
 
 @bare
-def _evaluate(labels, pixels, models, n_range, scale, offset, lens, scratch, edge, inner, normals):  # type: ignore[no-untyped-def]
+def _evaluate(labels, pixels, models, scale, offset, lens, edge, inner, normals):  # type: ignore[no-untyped-def]
     for i in range(pixels.shape[0]):
         row = 0.5 * (pixels[i, 0] + pixels[i, 2])
         col = 0.5 * (pixels[i, 1] + pixels[i, 3])
@@ -139,9 +132,11 @@ def _evaluate(labels, pixels, models, n_range, scale, offset, lens, scratch, edg
             way = INSIDE_PX if side == 1 else -INSIDE_PX
             r = pixels[i, 2 * side] + way * down
             c = pixels[i, 2 * side + 1] + way * (1.0 - down)
-            _point(models, k, row, col, n_range, scale, offset, lens, edge[i, side])
-            _point(models, k, r, c, n_range, scale, offset, lens, inner[i, side])
-            _normal(models, k, r, c, n_range, scale, offset, lens, scratch, normals[i, side])
+            x, y, z = _point(models, k, row, col, scale, offset, lens)
+            edge[i, side, 0], edge[i, side, 1], edge[i, side, 2] = x, y, z
+            x, y, z = _point(models, k, r, c, scale, offset, lens)
+            inner[i, side, 0], inner[i, side, 1], inner[i, side, 2] = x, y, z
+            _normal(models, k, r, c, scale, offset, lens, normals[i, side])
 
 
 @bare
@@ -172,16 +167,12 @@ def find_links(scene: Scene) -> Links:
         room = np.empty((found, 4), np.int64)
         _find(scene.surface_labels, GAP_PX, room)
     pixels = room[:found]
-    signals, n = scene.signals, scene.signals.n_range
-    lens = np.zeros(4)
+    signals, lens = scene.signals, np.zeros(4)
     if signals.inverse_depth:
         assert scene.camera is not None
         lens[:] = scene.camera.fx, scene.camera.fy, scene.camera.cx, scene.camera.cy
     edge, inner, normals = (np.empty((found, 2, 3)) for _ in range(3))
-    _evaluate(
-        scene.labels, pixels, scene.models, n, signals.scale, signals.offset, lens, np.empty((4, 3)), edge,
-        inner, normals,
-    )  # fmt: skip
+    _evaluate(scene.labels, pixels, scene.models, signals.scale, signals.offset, lens, edge, inner, normals)
     angle, apart, slant = (np.empty(found) for _ in range(3))
     _compare(edge, inner, normals, angle, apart, slant)
     both = scene.surface_labels[pixels[:, ::2], pixels[:, 1::2]].astype(np.int64)

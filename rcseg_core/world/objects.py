@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from rcseg_core.world.boxes import box_of, points_of, stands_on
+from rcseg_core.world.boxes import Borders, box_of, points_of, stands_on
 from rcseg_core.world.contacts import Links
 from rcseg_core.world.scene import Scene
 from rcseg_core.world.shell import find_shell
@@ -49,11 +49,11 @@ def find_objects(
     number = number[groups]
     labels = np.take(number, scene.surface_labels)
     points = points_of(scene, labels, sizes[[0, *order]].astype(np.int64))
-    objects = []
+    borders, objects = Borders(links, number), []
     for k in range(1, len(order) + 1):
         members = tuple(int(s) for s in np.flatnonzero(number == k))
         box = box_of(scene, members, points[k], up)
-        support = stands_on(scene, members, points[k], up, links)
+        support = stands_on(scene, k, points[k], up, borders)
         objects.append(Object(k, members, int(sizes[order[k - 1]]), box, support))
     return labels, tuple(objects)
 

@@ -78,16 +78,19 @@ def find_rings(scene: Scene) -> Rings:
 def _with_horizon(scene: Scene, camera: PinholeCamera) -> Array:
     """(M + 1, 3) normal over distance of planes whose horizon comes near their box in the image; 0 for
     others."""
-    planes = np.zeros((len(scene.surfaces) + 1, 3))
-    for surface, plane in zip(scene.surfaces, scene.planes, strict=True):
-        if plane is None:
-            continue
-        corners = np.array([(r, c) for r in surface.box[::2] for c in surface.box[1::2]], float)
-        rays = (corners[:, ::-1] - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
-        inverse = (rays @ plane.normal[:2] + plane.normal[2]) / plane.distance
-        if inverse.min() < NEAR_HORIZON * inverse.max():
-            planes[surface.label] = plane.normal / plane.distance
-    return planes
+    out = np.zeros((len(scene.surfaces) + 1, 3))
+    planes = [(s.label, s.box, p) for s, p in zip(scene.surfaces, scene.planes, strict=True) if p is not None]
+    if not planes:
+        return out
+    labels = np.array([label for label, _, _ in planes])
+    boxes = np.array([box for _, box, _ in planes], float)
+    over = np.array([plane.normal / plane.distance for _, _, plane in planes])
+    x, y = (boxes[:, 1::2] - camera.cx) / camera.fx, (boxes[:, ::2] - camera.cy) / camera.fy
+    inverse = x[:, :, None] * over[:, :1, None] + y[:, None] * over[:, 1:2, None] + over[:, 2:, None]
+    corners = inverse.reshape(-1, 4)
+    near = corners.min(axis=1) < NEAR_HORIZON * corners.max(axis=1)
+    out[labels[near]] = over[near]
+    return out
 
 
 def outline(scene: Scene, surface: Shaped) -> Boundary:
@@ -95,15 +98,17 @@ def outline(scene: Scene, surface: Shaped) -> Boundary:
     rings = find_rings(scene)
     parts = _parts(rings, np.flatnonzero(rings.surfaces == surface.label), scene.config.polygon_least)
     plane = scene.planes[surface.label - 1]
+    rays = _rays_of(scene, rings) if scene.camera is not None else None
     drawn, polygons = [], []
     for part in parts:
         local = []
         for i in part:
-            pixels = rings.vertices[rings.starts[i] : rings.starts[i + 1]]
-            if plane is not None and scene.camera is not None:
-                points = _on_plane(scene, plane, pixels)
+            own = slice(rings.starts[i], rings.starts[i + 1])
+            pixels = rings.vertices[own]
+            if plane is not None and rays is not None:
+                points = _on_plane(plane, rays[own])
             else:
-                points = _on_models(scene, pixels, rings.owners[rings.starts[i] : rings.starts[i + 1]])
+                points = _on_models(scene, pixels, rings.owners[own])
             drawn.append(Ring(pixels, points, i != part[0]))
             if plane is not None:
                 local.append((points - plane.origin) @ plane.pose[:3, :2])
@@ -142,9 +147,15 @@ def _rays(scene: Scene, pixels: Array) -> Array:
     return rays
 
 
-def _on_plane(scene: Scene, plane: LocalPlane, pixels: Array) -> Array:
-    """(n, 3) where the rays of pixels meet a plane; at its horizon as far away as half the least ahead."""
-    rays = _rays(scene, pixels)
+def _rays_of(scene: Scene, rings: Rings) -> Array:
+    """The rays of all vertices of a scene's rings, once."""
+    if "rays" not in scene.known:
+        scene.known["rays"] = _rays(scene, rings.vertices)
+    return np.asarray(scene.known["rays"])
+
+
+def _on_plane(plane: LocalPlane, rays: Array) -> Array:
+    """(n, 3) where rays meet a plane; at its horizon as far away as half the least ahead."""
     inverse = rays @ plane.normal / plane.distance
     ahead = inverse[inverse > 0]
     return rays / np.maximum(inverse, 0.5 * ahead.min() if len(ahead) else 1.0)[:, None]

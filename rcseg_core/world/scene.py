@@ -90,40 +90,73 @@ class Scene:
     @cached_property
     def points(self) -> NDArray[np.float32]:
         """(H, W, 3) float32, m: the measured points; NaN where there is no depth."""
-        signals = self.signals
         points = np.empty((*self.labels.shape, 3), np.float32)
-        lens = np.zeros(4)
-        if signals.inverse_depth:
-            assert self.camera is not None
-            lens[:] = self.camera.fx, self.camera.fy, self.camera.cx, self.camera.cy
+        lens = self._lens
         across = (np.arange(points.shape[1]) - lens[2]) / (lens[0] or 1.0)
+        signals = self.signals
         _measure(signals.image, signals.flags, signals.scale, signals.offset, lens, across, points)
         return points
+
+    def points_at(self, rows: NDArray[np.int64], cols: NDArray[np.int64]) -> NDArray[np.float32]:
+        """(n, 3) `points` of some pixels (n,), without those of all others."""
+        points, signals = np.empty((len(rows), 3), np.float32), self.signals
+        _measure_at(
+            signals.image, signals.flags, signals.scale, signals.offset, self._lens, rows, cols, points
+        )
+        return points
+
+    @property
+    def _lens(self) -> NDArray[np.float64]:
+        """(4,) fx, fy, cx, cy; 0 where channels are x, y, z."""
+        if not self.signals.inverse_depth:
+            return np.zeros(4)
+        camera = self.camera
+        assert camera is not None
+        return np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float64)
 
     @cached_property
     def sample(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """(n, 3) some `SAMPLE` of the points, all over the image, and (n,) how far each is from the origin,
         m."""
         stride = 1 + int(np.sqrt(self.labels.size / SAMPLE))
-        points = self.points[::stride, ::stride].reshape(-1, 3).astype(np.float64)
+        height, width = self.labels.shape
+        rows, cols = np.mgrid[:height:stride, :width:stride].reshape(2, -1)
+        points = self.points_at(rows, cols).astype(np.float64)
         points = points[np.isfinite(points[:, 2])]
         return points, np.sqrt(np.einsum("ni,ni->n", points, points))
+
+
+@bare
+def _put_point(image, flags, scale, offset, inverse, row, col, across, down, point):  # type: ignore[no-untyped-def]
+    """The measured point (3,) of a pixel."""
+    if flags[row, col] & INVALID:
+        point[:] = np.nan
+    elif not inverse:
+        for c in range(3):
+            point[c] = image[row, col, c] * scale[c] + offset[c]
+    else:
+        depth = 1.0 / (image[row, col, 0] * scale[0] + offset[0])
+        point[0] = across * depth
+        point[1] = down * depth
+        point[2] = depth
 
 
 @bare
 def _measure(image, flags, scale, offset, lens, across, points):  # type: ignore[no-untyped-def]
     """points (H, W, 3): the range of whitened signals; lens : (fx, fy, cx, cy), fx = 0 for x, y, z;
     across : (W,) x over depth."""
+    inverse = lens[0] != 0.0
     for row in range(points.shape[0]):
-        down = (row - lens[3]) / lens[1] if lens[0] != 0.0 else 0.0
+        down = (row - lens[3]) / lens[1] if inverse else 0.0
         for col in range(points.shape[1]):
-            if flags[row, col] & INVALID:
-                points[row, col, :] = np.nan
-            elif lens[0] == 0.0:
-                for c in range(3):
-                    points[row, col, c] = image[row, col, c] * scale[c] + offset[c]
-            else:
-                depth = 1.0 / (image[row, col, 0] * scale[0] + offset[0])
-                points[row, col, 0] = across[col] * depth
-                points[row, col, 1] = down * depth
-                points[row, col, 2] = depth
+            _put_point(image, flags, scale, offset, inverse, row, col, across[col], down, points[row, col])
+
+
+@bare
+def _measure_at(image, flags, scale, offset, lens, rows, cols, points):  # type: ignore[no-untyped-def]
+    """points (n, 3): `_measure` at pixels (n,)."""
+    inverse = lens[0] != 0.0
+    for i in range(rows.size):
+        across = (cols[i] - lens[2]) / lens[0] if inverse else 0.0
+        down = (rows[i] - lens[3]) / lens[1] if inverse else 0.0
+        _put_point(image, flags, scale, offset, inverse, rows[i], cols[i], across, down, points[i])

@@ -31,7 +31,7 @@ from rosbags.typesys.store import Typestore
 
 from rcseg_core.errors import InputError
 
-#: Of zstd, for chunks.
+#: Of zstd, for chunks: it goes in steps of four bytes, as the numbers of a point do (docs/batch.md).
 LEVEL = -3
 _MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, number, times of recording and of publishing
 NAMESPACE = "/rcseg"  # the node's name: its ~/labels is /rcseg/labels

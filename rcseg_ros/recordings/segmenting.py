@@ -174,8 +174,8 @@ def frame_row(
         "color_offset_ns": offset_ns,
         "height": frame.height,
         "width": frame.width,
-        "valid_share": float(frame.valid.mean()),
-        "labelled_share": float((result.labels > 0).mean()),
+        "valid_share": np.count_nonzero(frame.valid) / frame.valid.size,
+        "labelled_share": np.count_nonzero(result.labels) / result.labels.size,
         "regions": int(result.labels.max(initial=0)),  # to count them is not to describe them
         "surfaces": int(result.surface_labels.max(initial=0)),
         "segment_ms": seconds * 1e3,

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rcseg_ros.results.cdr import Cdr, Serialized
+from rcseg_ros.results.outputs import put_points
 
 _FLOAT32 = 7
 _KINDS = {"u1": 2, "u4": 6, "f4": _FLOAT32}  # constants of sensor_msgs/PointField
@@ -46,10 +47,10 @@ def part_cloud(
     """
     at = np.flatnonzero(chosen)
     rows = np.empty((len(at), 5), "<f4")
-    rows[:, :3] = points.reshape(-1, 3)[at]
+    put_points(rows, np.take(points.reshape(-1, 3), at, axis=0))
     whole = rows.view("<u4")
-    whole[:, 3] = labels.ravel()[at]
-    whole[:, 4] = surface_labels.ravel()[at]
+    whole[:, 3] = labels[chosen]
+    whole[:, 4] = surface_labels[chosen]
     return _cloud(rows, PART, 1, len(at), True, header)
 
 
@@ -72,7 +73,7 @@ def labelled_cloud(
     """
     height, width = labels.shape
     cells = np.empty((height, width, 8), "<f4")
-    cells[..., :3] = points
+    put_points(cells, points)
     unseen = cells[..., 2] == 0
     if unseen.any():
         cells[unseen, :3] = np.nan

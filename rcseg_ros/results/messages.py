@@ -23,7 +23,7 @@ from rcseg_core.tracking import Tracks
 from rcseg_core.world import World
 from rcseg_ros.patches import bernstein
 from rcseg_ros.results.outputs import Make
-from rcseg_ros.results.world import objects_of_surfaces, surface_fields, up_vector
+from rcseg_ros.results.world import objects_of_surfaces, pose_message, surface_fields, up_vector
 
 SHAPE_KINDS = {"none": 0, "plane": 1, "sphere": 2, "cylinder": 3}  # the constants of Primitive.msg
 PATCH_KINDS = {"inverse_depth": 1, "xyz": 2, "rgb": 3}  # the constants of BezierPatch.msg
@@ -215,7 +215,7 @@ def shape_messages(form: LocalPlane | LocalSphere | LocalCylinder | None, make: 
 
 
 def _plane(form: Any, make: Make) -> Any:
-    return make("rcseg_msgs/msg/Plane", pose=_pose(form.pose, make), **_errors(form))
+    return make("rcseg_msgs/msg/Plane", pose=pose_message(form.pose, make), **_errors(form))
 
 
 def _sphere(form: Any, make: Make) -> Any:
@@ -224,21 +224,12 @@ def _sphere(form: Any, make: Make) -> Any:
 
 
 def _cylinder(form: Any, make: Make) -> Any:
-    pose = _pose(form.pose, make)
+    pose = pose_message(form.pose, make)
     return make("rcseg_msgs/msg/Cylinder", pose=pose, radius=form.radius, **_errors(form))
 
 
 def _errors(form: Any) -> dict[str, NDArray[np.float64]]:
     return {"covariance": _flat(form.covariance), "systematic": _flat(form.systematic)}
-
-
-def _pose(matrix: NDArray[np.float64], make: Make) -> Any:
-    turn = Rotation.from_matrix(matrix[:3, :3]).as_quat().tolist()
-    return make(
-        "geometry_msgs/msg/Pose",
-        position=_xyz("Point", matrix[:3, 3].tolist(), make),
-        orientation=make("geometry_msgs/msg/Quaternion", **dict(zip("xyzw", turn, strict=True))),
-    )
 
 
 def _noise(result: Segmentation, make: Make) -> Any:

@@ -70,6 +70,13 @@ def _image_message(pixels: NDArray[Any], encoding: str, header: Any, make: Make)
     )
 
 
+def put_points(cells: NDArray[np.float32], points: NDArray[Any]) -> None:
+    """Points (..., 3) into the first three of cells (..., k), one axis at a time: numpy copies a long row of
+    numbers many times sooner than many rows of three."""
+    for axis in range(3):
+        cells[..., axis] = points[..., axis]
+
+
 def cloud_message(
     points: NDArray[np.float32], color: NDArray[np.uint8], labels: NDArray[np.int32], header: Any, make: Make
 ) -> Any:
@@ -79,7 +86,7 @@ def cloud_message(
     """
     height, width = labels.shape
     cloud = np.empty((height, width, 5), "<f4")  # as _CLOUD_DTYPE says: all fields are four bytes wide
-    cloud[..., :3] = points
+    put_points(cloud, points)
     bits = cloud.view("<u4")
     bgra = cv2.cvtColor(np.asarray(color, np.uint8), cv2.COLOR_RGB2BGRA)
     bits[..., 3] = bgra.view("<u4")[..., 0] & 0xFFFFFF

@@ -6,6 +6,8 @@ the batches of many frames are put together.
 
 from __future__ import annotations
 
+import struct
+import zlib
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from typing import Any
@@ -16,7 +18,7 @@ import pyarrow as pa
 import shapely
 from numpy.typing import NDArray
 
-from rcseg_core import RangeColorFrame, Region, Surface
+from rcseg_core import BezierPatch, RangeColorFrame, Region, Surface
 from rcseg_core.errors import InputError
 from rcseg_core.result.seen import region_areas
 from rcseg_core.tracking import KINDS
@@ -25,12 +27,10 @@ from rcseg_ros.recordings.segmenting import Segmented
 from rcseg_ros.results.made import Named
 from rcseg_ros.tables.schema import arrow_schema
 
-#: Of all levels of zlib the first, of its strategies runs: label images are runs, and more takes longer.
-_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
-if hasattr(
-    cv2, "IMWRITE_PNG_FILTER"
-):  # releases that have it try three filters a row, which takes twice the time
-    _PNG += [cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_UP]
+#: What a PNG starts with, and its last chunk.
+_PNG_START, _PNG_END = b"\x89PNG\r\n\x1a\n", b"\0\0\0\0IEND\xaeB`\x82"
+#: Number of the filter that takes from each row the one above.
+_UP = 2
 
 Rows = Mapping[str, pa.RecordBatch]
 
@@ -81,23 +81,37 @@ def decode_label_image(png: bytes) -> NDArray[np.uint16]:
 
 
 def encode_label_image(labels: NDArray[np.int32]) -> bytes:
-    """A label image as PNG of 16 bits."""
+    """A label image as PNG of 16 bits.
+
+    Written here, as label images are runs: less the row above, and by zlib's runs of bytes, they take a third
+    less time than in OpenCV, whose releases differ in what may be asked of them.
+    """
     if labels.max(initial=0) > 0xFFFF:
         raise InputError(f"{labels.max()} labels do not fit into 16 bits; coarsen the segmentation")
-    done, data = cv2.imencode(".png", labels.astype(np.uint16), _PNG)
-    if not done:
-        raise InputError(f"labels of {labels.shape[1]}x{labels.shape[0]} do not fit into a PNG")
-    return bytes(data)
+    height, width = labels.shape
+    pixels = labels.astype(">u2", order="C").view(np.uint8)
+    rows = np.empty((height, 1 + 2 * width), np.uint8)
+    rows[:, 0], rows[0, 1:] = _UP, pixels[0]
+    np.subtract(pixels[1:], pixels[:-1], out=rows[1:, 1:])
+    zlib_runs = zlib.compressobj(1, strategy=zlib.Z_RLE)
+    packed = zlib_runs.compress(rows) + zlib_runs.flush()
+    head = struct.pack(">2I5B", width, height, 16, 0, 0, 0, 0)  # 16 bits of grey
+    return b"".join([_PNG_START, *_png_chunk(b"IHDR", head), *_png_chunk(b"IDAT", packed), _PNG_END])
+
+
+def _png_chunk(kind: bytes, data: bytes) -> tuple[bytes, ...]:
+    return struct.pack(">I", len(data)), kind, data, struct.pack(">I", zlib.crc32(data, zlib.crc32(kind)))
 
 
 class _Names:
     """Track ids of labels; None where the frame was not named."""
 
     def __init__(self, named: Named | None) -> None:
-        self._ids = {} if named is None else {kind: named.tracks.ids(kind).tolist() for kind in KINDS}
+        self._ids = {} if named is None else {kind: named.tracks.ids(kind) for kind in KINDS}
 
-    def of(self, kind: str, label: int) -> int | None:
-        return self._ids[kind][label] if self._ids else None
+    def of(self, kind: str, count: int) -> NDArray[np.int32] | None:
+        """(count,) of the labels 1..count."""
+        return self._ids[kind][1 : count + 1] if self._ids else None
 
 
 class _Sums:
@@ -111,8 +125,8 @@ class _Sums:
         self._centroids = np.array([region.centroid for region in regions]).reshape(-1, 3)
         self._persistence = np.array([region.persistence for region in regions])
 
-    def of(self, groups: Sequence[Sequence[int]]) -> list[dict[str, Any]]:
-        """Columns of the union of some regions, for each group of labels."""
+    def columns(self, groups: Sequence[Sequence[int]]) -> dict[str, NDArray[np.float64]]:
+        """Of the union of some regions, for each group of labels."""
         group = np.repeat(np.arange(len(groups)), [len(labels) for labels in groups])
         at = np.array([label for labels in groups for label in labels], int) - 1
 
@@ -127,13 +141,12 @@ class _Sums:
         known = weight * np.isfinite(centers[:, 0])
         persistence = np.zeros(len(groups))
         np.maximum.at(persistence, group, self._persistence[at])
-        columns = {
+        return {
             "centroid": mean(np.nan_to_num(centers), known),
-            "area_m2": total(self._areas[at]).tolist(),
+            "area_m2": total(self._areas[at]),
             "mean_color": mean(self._colors[at], weight),
-            "persistence": persistence.tolist(),
+            "persistence": persistence,
         }
-        return [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
 
 
 def _frame(frame: RangeColorFrame, world: World, row: Mapping[str, Any], log_ns: int) -> pa.RecordBatch:
@@ -159,157 +172,162 @@ def _frame(frame: RangeColorFrame, world: World, row: Mapping[str, Any], log_ns:
 
 
 def _surfaces(surfaces: Sequence[Surface], world: World, whole: _Sums, names: _Names) -> pa.RecordBatch:
-    member = {label: one.label for one in world.objects for label in one.surfaces}
-    sums = whole.of([surface.regions for surface in surfaces])
-    rows = [
-        own
-        | _box(surface.box)
+    member = np.zeros(len(surfaces) + 1, np.int32)
+    for one in world.objects:
+        member[list(one.surfaces)] = one.label
+    categories = world.categories
+    return _batch(
+        "surfaces",
+        len(surfaces),
+        whole.columns([surface.regions for surface in surfaces])
+        | _boxes([surface.box for surface in surfaces])
         | {
-            "surface": surface.label,
-            "track": names.of("surface", surface.label),
-            "object": member.get(surface.label, 0),
-            "category": category.name,
-            "category_probability": category.probability,
-            "pixel_count": surface.pixel_count,
-            "regions": surface.regions,
-            "polygon": _well_known_binary(boundary.polygons),
+            "surface": [surface.label for surface in surfaces],
+            "track": names.of("surface", len(surfaces)),
+            "object": member[1:],
+            "category": [category.name for category in categories],
+            "category_probability": [category.probability for category in categories],
+            "pixel_count": [surface.pixel_count for surface in surfaces],
+            "regions": [surface.regions for surface in surfaces],
+            "polygon": _well_known_binary([boundary.polygons for boundary in world.boundaries]),
         }
-        | _primitive(surface)
-        for surface, category, boundary, own in zip(
-            surfaces, world.categories, world.boundaries, sums, strict=True
-        )
-    ]
-    return _batch("surfaces", rows)
+        | _primitives(surfaces),
+    )
 
 
-def _primitive(surface: Surface) -> dict[str, Any]:
-    found, local = surface.primitive, surface.local
-    known = found.kind != "none"
-    columns = {name: getattr(found, name) for name in ("rms_m", "rms_sigma", "misfit_m", "p_value")}
-    if not known:
-        return {"kind": found.kind}
+def _primitives(surfaces: Sequence[Surface]) -> dict[str, list[Any]]:
+    shapes = [None if s.primitive.kind == "none" else s.primitive for s in surfaces]
+    numbers = ("convex", "rms_m", "rms_sigma", "misfit_m", "p_value")
+    columns = {name: [None if one is None else getattr(one, name) for one in shapes] for name in numbers}
+    forms = [surface.local for surface in surfaces]
     return columns | {
-        "kind": found.kind,
-        "convex": found.convex,
-        "parameters": np.concatenate([np.ravel(value) for value in found.parameters.values()]),
-        "parameter_covariance": np.ravel(found.covariance),
-        "pose": None if getattr(local, "pose", None) is None else np.ravel(local.pose),
-        "covariance": None if local is None else np.ravel(local.covariance),
-        "systematic": None if local is None else np.ravel(local.systematic),
+        "kind": [surface.primitive.kind for surface in surfaces],
+        "parameters": [
+            None if one is None else np.concatenate([np.ravel(value) for value in one.parameters.values()])
+            for one in shapes
+        ],
+        "parameter_covariance": [None if one is None else one.covariance for one in shapes],
+        "pose": [getattr(form, "pose", None) for form in forms],
+        "covariance": [None if form is None else form.covariance for form in forms],
+        "systematic": [None if form is None else form.systematic for form in forms],
     }
 
 
-def _well_known_binary(parts: Sequence[shapely.Polygon]) -> bytes | None:
-    """The outline of a plane: a Polygon, or a MultiPolygon where it has several parts."""
-    if not parts:
-        return None
-    return bytes(shapely.to_wkb(parts[0] if len(parts) == 1 else shapely.MultiPolygon(parts)))
+def _well_known_binary(outlines: Sequence[Sequence[shapely.Polygon]]) -> list[bytes | None]:
+    """Outlines of planes: Polygons, or MultiPolygons where they have several parts; None of no part."""
+    shapes = [
+        parts[0] if len(parts) == 1 else shapely.MultiPolygon(parts) if parts else None for parts in outlines
+    ]
+    return list(shapely.to_wkb(np.array(shapes, object)))
 
 
 def _objects(
     objects: Sequence[Object], surfaces: Sequence[Surface], whole: _Sums, names: _Names
 ) -> pa.RecordBatch:
-    sums = whole.of(
+    sums = whole.columns(
         [[label for surface in one.surfaces for label in surfaces[surface - 1].regions] for one in objects]
     )
-    rows = [
-        own
+    return _batch(
+        "objects",
+        len(objects),
+        sums
         | {
-            "object": one.label,
-            "track": names.of("object", one.label),
-            "surfaces": one.surfaces,
-            "pixel_count": one.pixel_count,
-            "pose": np.ravel(one.box3d.pose),
-            "size": np.ravel(one.box3d.size),
-            "stands_on": one.stands_on,
-        }
-        for one, own in zip(objects, sums, strict=True)
-    ]
-    return _batch("objects", rows)
+            "object": [one.label for one in objects],
+            "track": names.of("object", len(objects)),
+            "surfaces": [one.surfaces for one in objects],
+            "pixel_count": [one.pixel_count for one in objects],
+            "pose": [one.box3d.pose for one in objects],
+            "size": [one.box3d.size for one in objects],
+            "stands_on": [one.stands_on for one in objects],
+        },
+    )
 
 
 def _regions(
     regions: Sequence[Region], areas: NDArray[np.float64], colors: NDArray[np.float64], names: _Names
 ) -> pa.RecordBatch:
-    rows = [
+    return _batch(
+        "regions",
+        len(regions),
         {
-            "region": region.label,
-            "track": names.of("region", region.label),
-            "surface": region.surface,
-            "pixel_count": region.pixel_count,
-            "neighbors": region.neighbors,
-            "centroid": region.centroid,
-            "normal": region.normal,
-            "area_m2": area,
-            "mean_color": color,
-            "persistence": region.persistence,
+            "region": [region.label for region in regions],
+            "track": names.of("region", len(regions)),
+            "surface": [region.surface for region in regions],
+            "pixel_count": [region.pixel_count for region in regions],
+            "neighbors": [region.neighbors for region in regions],
+            "centroid": [region.centroid for region in regions],
+            "normal": [region.normal for region in regions],
+            "area_m2": areas,
+            "mean_color": colors,
+            "persistence": [region.persistence for region in regions],
         }
-        | _box(region.box)
-        | _patch("range", region.range_patch)
-        | _patch("color", region.color_patch)
-        for region, area, color in zip(regions, areas.tolist(), colors, strict=True)
-    ]
-    return _batch("regions", rows)
+        | _boxes([region.box for region in regions])
+        | _patches("range", [region.range_patch for region in regions])
+        | _patches("color", [region.color_patch for region in regions]),
+    )
 
 
-def _patch(which: str, patch: Any) -> dict[str, Any]:
-    return {
-        f"{which}_kind": patch.kind,
-        f"{which}_degree": patch.degree,
-        f"{which}_control_points": patch.control_points.ravel(),
-        f"{which}_standard_errors": patch.standard_errors.ravel(),
-        f"{which}_covariance": patch.covariance.ravel(),
-    }
+def _patches(which: str, patches: Sequence[BezierPatch]) -> dict[str, list[Any]]:
+    names = ("kind", "degree", "control_points", "standard_errors", "covariance")
+    return {f"{which}_{name}": [getattr(patch, name) for patch in patches] for name in names}
 
 
 def _label_images(images: Mapping[str, NDArray[np.int32]]) -> pa.RecordBatch:
-    rows = [
+    labels = images.values()
+    return _batch(
+        "labels",
+        len(images),
         {
-            "kind": kind,
-            "height": labels.shape[0],
-            "width": labels.shape[1],
-            "png": encode_label_image(labels),
-        }
-        for kind, labels in images.items()
-    ]
-    return _batch("labels", rows)
+            "kind": list(images),
+            "height": [image.shape[0] for image in labels],
+            "width": [image.shape[1] for image in labels],
+            "png": [encode_label_image(image) for image in labels],
+        },
+    )
 
 
-def _box(box: tuple[int, int, int, int]) -> dict[str, int]:
-    return dict(zip(("row_min", "col_min", "row_max", "col_max"), box, strict=True))
+def _boxes(boxes: Sequence[tuple[int, int, int, int]]) -> dict[str, NDArray[np.int64]]:
+    columns = np.array(boxes, np.int64).reshape(-1, 4).T
+    return dict(zip(("row_min", "col_min", "row_max", "col_max"), columns, strict=True))
 
 
 def _one_row(table: str, values: Mapping[str, Any]) -> pa.RecordBatch:
-    return _batch(table, [values])
+    return _batch(table, 1, {name: [value] for name, value in values.items()})
 
 
-def _batch(table: str, rows: Sequence[Mapping[str, Any]]) -> pa.RecordBatch:
-    """Rows as a record batch; what a row does not name is null."""
+def _batch(table: str, count: int, columns: Mapping[str, Any]) -> pa.RecordBatch:
+    """Columns of some rows as a record batch; a column that is not named, or None, is null.
+
+    columns : sequences or arrays (count, ...), of lists of numbers: arrays of any shape, row by row
+    """
     schema, builders = _schema(table)
+    given = [columns.get(field.name) for field in schema]
     arrays = [
-        build([row.get(field.name) for row in rows], field.type)
-        for field, build in zip(schema, builders, strict=True)
+        pa.nulls(count, field.type) if column is None else build(column, field.type)
+        for field, build, column in zip(schema, builders, given, strict=True)
     ]
     return pa.RecordBatch.from_arrays(arrays, schema=schema)
 
 
 @cache
-def _schema(table: str) -> tuple[pa.Schema, list[Callable[[list[Any], pa.DataType], pa.Array]]]:
+def _schema(table: str) -> tuple[pa.Schema, list[Callable[[Any, pa.DataType], pa.Array]]]:
     schema = arrow_schema(table, keys=False)
     flat = [pa.types.is_list(field.type) and pa.types.is_primitive(field.type.value_type) for field in schema]
     return schema, [_lists if one else pa.array for one in flat]
 
 
-def _lists(values: list[Any], kind: pa.DataType) -> pa.Array:
+def _lists(values: Sequence[Any], kind: pa.DataType) -> pa.Array:
     """Lists of numbers: one array of them all, which is many times quicker than number by number."""
-    sizes = [0 if value is None else len(value) for value in values]
-    numbers = [value for value in values if value is not None and len(value)]
-    flat = np.concatenate(numbers) if numbers else np.empty(0)
-    offsets = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int32)
-    missing = np.array([value is None for value in values], bool)
-    content = pa.array(flat.astype(kind.value_type.to_pandas_dtype(), copy=False))
     if not len(values):
         return pa.array([], kind)
+    number = kind.value_type.to_pandas_dtype()
+    each = [np.empty(0) if value is None else np.ravel(value) for value in values]
+    offsets = np.zeros(len(each) + 1, np.int32)
+    np.cumsum([one.size for one in each], out=offsets[1:])
+    missing = [value is None for value in values]
     return pa.ListArray.from_arrays(
-        pa.array(offsets), content, type=kind, mask=pa.array(missing) if missing.any() else None
+        pa.array(offsets),
+        pa.array(np.concatenate(each).astype(number, copy=False)),
+        type=kind,
+        mask=pa.array(missing) if any(missing) else None,
     )

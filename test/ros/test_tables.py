@@ -157,7 +157,9 @@ def test_sums_over_groups_of_regions_are_those_of_single_ones():
     regions[2].centroid = np.full(3, np.nan)
     areas, colors = rng.random(6), rng.random((6, 3)) * 255
     groups = [[1, 3], [3], [2, 4, 5, 6]]
-    for labels, found in zip(groups, _Sums(regions, areas, colors).of(groups), strict=True):
+    sums = _Sums(regions, areas, colors).columns(groups)
+    for at, labels in enumerate(groups):
+        found = {name: column[at] for name, column in sums.items()}
         mine = [regions[label - 1] for label in labels]
         seen = [one for one in mine if np.isfinite(one.centroid[0])]
         center = sum((one.pixel_count * one.centroid for one in seen), np.zeros(3))
@@ -167,4 +169,5 @@ def test_sums_over_groups_of_regions_are_those_of_single_ones():
         np.testing.assert_allclose(found["mean_color"], color / sum(one.pixel_count for one in mine))
         assert found["area_m2"] == pytest.approx(sum(areas[i - 1] for i in labels))
         assert found["persistence"] == max(one.persistence for one in mine)
-    assert _Sums([], np.empty(0), np.empty((0, 3))).of([]) == []
+    none = _Sums([], np.empty(0), np.empty((0, 3))).columns([])
+    assert not any(len(column) for column in none.values())
