@@ -83,7 +83,10 @@ def points_of(scene: Scene, objects: NDArray[np.int32], sizes: NDArray[np.int64]
     rows, cols = np.zeros(first[-1], np.int64), np.zeros(first[-1], np.int64)
     _gather(flags, objects, sound, steps, taken, wait, first, rows, cols)
     points = scene.points_at(rows, cols).astype(np.float64)
-    return [points[first[k] : first[k] + taken[k]] if taken[k] else np.zeros((1, 3)) for k in range(count)]
+    within = np.isfinite(points[:, 2])  # beside a depth of micrometres one of metres is no number
+    slices = [slice(start, start + n) for start, n in zip(first, taken, strict=False)]
+    found = [points[each][within[each]] for each in slices]
+    return [each if len(each) else np.zeros((1, 3)) for each in found]
 
 
 def box_of(scene: Scene, members: Sequence[int], points: Array, up: Up | None) -> Box3d:

@@ -43,10 +43,11 @@ def told_up(up: object, covariance: object, source: str, config: WorldConfig) ->
             return None
         up, source = (config.up_x, config.up_y, config.up_z), "parameter"
     vector = _numbers(up, (3,), "up: expected 3 finite numbers in the sensor's frame")
-    length = float(np.linalg.norm(vector))
-    if not length > 0:
+    largest = float(np.abs(vector).max())
+    if not largest > 0:
         raise InputError("up: is (0, 0, 0), which points nowhere")
-    vector = vector / length
+    vector = vector / largest  # whose squares neither overflow nor vanish
+    vector = vector / np.linalg.norm(vector)
     across = np.eye(3) - np.outer(vector, vector)
     if covariance is None:
         return Up(vector, config.up_sigma**2 * across, source)

@@ -160,7 +160,7 @@ def check_tables(folder: Path) -> dict[str, int]:
             about = pq.ParquetFile(file)
             rows[name] = about.metadata.num_rows
             same = about.schema_arrow.equals(arrow_schema(name))
-        except (OSError, pa.ArrowException) as error:
+        except (OSError, pa.ArrowException, ValueError) as error:  # names that are no text, too
             raise InputError(f"{file}: not a whole table: {' '.join(str(error).split())}") from None
         if not same:
             raise InputError(f"{file}: its columns are not those of this version of rcseg")

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rcseg_core import segment
+from rcseg_core import PinholeCamera, RangeColorFrame, segment
 from rcseg_core.datasets import load_frame
 from rcseg_core.evaluation.frames import evaluate_frame, evaluate_scene
 from rcseg_core.synthetic import make_scene
@@ -173,3 +173,14 @@ def test_objects_of_recorded_tables(name, iou):
     frame = load_frame(DATA / name)
     parts = evaluate_frame(frame, segment(frame.frame), level="objects").parts
     assert parts.best_iou > iou and parts.parts_per_object < 1.3 and parts.purity > 0.95
+
+
+def test_a_box_round_depths_that_no_number_holds_together():
+    """Beside depths of a micrometre, one of 80 m is infinite in the units of the frame."""
+    depth = np.full((3, 3), 1e-6, np.float32)
+    depth[:, 0] = 80.0
+    frame = RangeColorFrame.from_depth(
+        depth, np.zeros((3, 3, 3), np.uint8), PinholeCamera(0.001, 0.001, 1.5, 1.5)
+    )
+    for one in segment(frame).world().objects:
+        assert np.isfinite(one.box3d.pose).all() and np.isfinite(one.box3d.size).all()

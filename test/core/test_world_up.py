@@ -12,7 +12,7 @@ from rcseg_core.shapes.plane_forms import LocalPlane
 from rcseg_core.synthetic import make_scene, make_terrain
 from rcseg_core.world import CATEGORIES, Up
 from rcseg_core.world.classes import facing, probability_within
-from rcseg_core.world.up import tilt_between, visible_area
+from rcseg_core.world.up import tilt_between, told_up, visible_area
 
 
 def turned(vector, axis, degrees):
@@ -218,3 +218,9 @@ def test_a_result_is_freed_at_once():
         assert watched() is None
     finally:
         gc.enable()
+
+
+@pytest.mark.parametrize("length", [1e300, 1e-300])
+def test_up_of_any_length_is_a_direction(length):
+    up = told_up((0.0, 0.6 * length, -0.8 * length), None, "test", SegmenterConfig().world)
+    np.testing.assert_allclose(up.vector, [0, 0.6, -0.8], atol=1e-15)

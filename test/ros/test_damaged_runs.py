@@ -8,6 +8,8 @@ import pytest
 
 pytest.importorskip("pyarrow", reason="pyarrow is not installed: pip install 'rcseg[test]'")
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 from fuzzing_results import take_run
 
 from rcseg_core.errors import InputError
@@ -15,7 +17,9 @@ from rcseg_ros.batch.inputs import find_inputs
 from rcseg_ros.batch.manifest import MANIFEST, read_manifest
 from rcseg_ros.batch.options import BATCH, check_same
 from rcseg_ros.batch.work import UNIT, Outcome, stored
+from rcseg_ros.tables.parquet import check_tables
 from rcseg_ros.tables.rows import decode_label_image
+from rcseg_ros.tables.schema import TABLES
 
 ENTRY = {"name": "a", "index": 0, "path": "/a.mcap", "size": 1, "mtime_ns": 2, "digest": "d"}
 PARTS = [[0, 9, 0]]
@@ -92,3 +96,12 @@ def test_tables_and_lists_that_are_cut_off_are_refused_or_read():
     for name in ("out/tables/recording=a/part=00000/labels.parquet", "list.txt", f"out/{BATCH}"):
         for data in (b"", b"\x00", b"\xff" * 50, b"PAR1" + bytes(40) + b"PAR1"):
             take_run((name, data))
+
+
+def test_a_table_whose_names_are_no_text_is_not_whole(tmp_path):
+    for name in TABLES:
+        pq.write_table(pa.table({"columnname": [1]}), tmp_path / f"{name}.parquet")
+    file = tmp_path / f"{next(iter(TABLES))}.parquet"
+    file.write_bytes(file.read_bytes().replace(b"columnname", b"\xf3olumnname"))
+    with pytest.raises(InputError, match=r"not a whole table|not those of this version"):
+        check_tables(tmp_path)
