@@ -53,6 +53,29 @@ def _distance(kind, vector, x, y, z, gradient):  # type: ignore[no-untyped-def]
 
 
 @bare
+def _step(share, mx, my, mz, radius):  # type: ignore[no-untyped-def]
+    """The share of the direction (mx, my, mz) that leads to a curved shape, half a radius at the most."""
+    far = abs(share) * np.sqrt(mx * mx + my * my + mz * mz)
+    if far > 0.5 * radius:  # nowhere near: the straight line says nothing
+        share *= 0.5 * radius / far
+    return share
+
+
+@bare
+def _slopes(kind, frame, sigma, gx, gy, gz, along, row):  # type: ignore[no-untyped-def]
+    """Derivatives of a whitened distance by the local parameters of a curved shape: row (q,)."""
+    if kind == SPHERE:
+        row[0], row[1], row[2], row[3] = -gx / sigma, -gy / sigma, -gz / sigma, -1.0 / sigma
+        return
+    # an axis a -> a + t e moves the foot of x by t (a . (x - p)) e, across the axis
+    first = -(gx * frame[0, 0] + gy * frame[0, 1] + gz * frame[0, 2])
+    second = -(gx * frame[1, 0] + gy * frame[1, 1] + gz * frame[1, 2])
+    row[0], row[1] = first / sigma, second / sigma
+    row[2], row[3] = along * first / sigma, along * second / sigma
+    row[4] = -1.0 / sigma
+
+
+@bare
 def _miss(kind, vector, frame, point, spread, row, gradient):  # type: ignore[no-untyped-def]
     """Whitened distance of one point and its noise; derivatives into row (q,), gradient (3,).
 
@@ -80,10 +103,7 @@ def _miss(kind, vector, frame, point, spread, row, gradient):  # type: ignore[no
         sigma = np.sqrt(variance)
         whitened += distance / sigma
         if step == 0 and kind != PLANE:
-            share = distance / variance
-            far = abs(share) * np.sqrt(mx * mx + my * my + mz * mz)
-            if far > 0.5 * vector[6]:  # nowhere near: the straight line says nothing
-                share *= 0.5 * vector[6] / far
+            share = _step(distance / variance, mx, my, mz, vector[6])
             x -= share * mx
             y -= share * my
             z -= share * mz
@@ -94,19 +114,10 @@ def _miss(kind, vector, frame, point, spread, row, gradient):  # type: ignore[no
         row[0] = x * frame[0, 0] + y * frame[0, 1] + z * frame[0, 2]
         row[1] = x * frame[1, 0] + y * frame[1, 1] + z * frame[1, 2]
         row[2] = -1.0
-    elif kind == SPHERE:
-        row[0] = -gradient[0]
-        row[1] = -gradient[1]
-        row[2] = -gradient[2]
-        row[3] = -1.0
+        for j in range(3):
+            row[j] /= sigma
     else:
-        # an axis a -> a + t e moves the foot of x by t (a . (x - p)) e, across the axis
-        for j in range(2):
-            row[j] = -(gradient[0] * frame[j, 0] + gradient[1] * frame[j, 1] + gradient[2] * frame[j, 2])
-            row[2 + j] = along * row[j]
-        row[4] = -1.0
-    for j in range(FREEDOM[kind]):
-        row[j] /= sigma
+        _slopes(kind, frame, sigma, gradient[0], gradient[1], gradient[2], along, row)
     return whitened, sigma
 
 
@@ -133,29 +144,12 @@ def _ray_miss(kind, vector, x, y, z, sx, sy, sz):  # type: ignore[no-untyped-def
         sigma = np.sqrt(variance)
         whitened += distance / sigma
         if step == 0:
-            share = distance / variance
             mx, my, mz = sx * part, sy * part, sz * part
-            far = abs(share) * np.sqrt(mx * mx + my * my + mz * mz)
-            if far > 0.5 * vector[6]:  # nowhere near: the straight line says nothing
-                share *= 0.5 * vector[6] / far
+            share = _step(distance / variance, mx, my, mz, vector[6])
             x -= share * mx
             y -= share * my
             z -= share * mz
     return whitened, sigma, gx, gy, gz, along
-
-
-@bare
-def _slopes(kind, frame, sigma, gx, gy, gz, along, row):  # type: ignore[no-untyped-def]
-    """Derivatives of a whitened distance by the local parameters of a curved shape: row (q,)."""
-    if kind == SPHERE:
-        row[0], row[1], row[2], row[3] = -gx / sigma, -gy / sigma, -gz / sigma, -1.0 / sigma
-        return
-    # an axis a -> a + t e moves the foot of x by t (a . (x - p)) e, across the axis
-    first = -(gx * frame[0, 0] + gy * frame[0, 1] + gz * frame[0, 2])
-    second = -(gx * frame[1, 0] + gy * frame[1, 1] + gz * frame[1, 2])
-    row[0], row[1] = first / sigma, second / sigma
-    row[2], row[3] = along * first / sigma, along * second / sigma
-    row[4] = -1.0 / sigma
 
 
 @bare
