@@ -88,6 +88,19 @@ def predict(models, k, row, col, modality, c):  # type: ignore[no-untyped-def]
     return total
 
 
+@bare
+def along_row(models, k, row, n_range, line):  # type: ignore[no-untyped-def]
+    """Region k along a row, added up as in `predict`: line[c, a] (C or Cr, D + 1), the factor of x^a."""
+    y = (row - models.center[k, 1]) / UNIT_PX
+    for c in range(line.shape[0]):
+        degree = models.degree[k, 0 if c < n_range else 1]
+        for a in range(degree + 1):
+            part = 0.0
+            for b in range(degree, -1, -1):
+                part = part * y + models.coef[k, c, a, b]
+            line[c, a] = part
+
+
 @inlined
 def pixel_cost(models, k, image, flags, row, col, n_range, law, color_eps2):  # type: ignore[no-untyped-def]
     """Squared residual of a pixel under region k, each modality over its noise plus half of the tolerance.

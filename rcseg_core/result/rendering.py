@@ -12,22 +12,9 @@ from numpy.typing import NDArray
 from rcseg_core.compute.jit import bare
 from rcseg_core.compute.parallel import BANDS, over_bands
 from rcseg_core.frame import PinholeCamera
-from rcseg_core.models.polynomials import Models
+from rcseg_core.models.polynomials import Models, along_row
 from rcseg_core.signal.signals import Signals
 from rcseg_core.signal.units import UNIT_PX
-
-
-@bare
-def _along_row(models, k, row, n_range, line):  # type: ignore[no-untyped-def]
-    """line[c, a]: coefficient of x^a of channel c of region k in a row."""
-    y = (row - models.center[k, 1]) / UNIT_PX
-    for c in range(line.shape[0]):
-        degree = models.degree[k, 0 if c < n_range else 1]
-        for a in range(degree + 1):
-            part = 0.0
-            for b in range(degree, -1, -1):
-                part = part * y + models.coef[k, c, a, b]
-            line[c, a] = part
 
 
 @bare
@@ -91,7 +78,7 @@ def _render(models, labels, n_range, scale, offset, lens, across, first, last, l
                 points[row, start:end] = np.nan
                 color[row, start:end] = 0
                 continue
-            _along_row(models, k, row, n_range, line)
+            along_row(models, k, row, n_range, line)
             center = models.center[k, 0]
             for c in range(line.shape[0]):
                 degree = models.degree[k, 0 if c < n_range else 1]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rcseg_core.compute.jit import bare
-from rcseg_core.models.polynomials import predict
+from rcseg_core.models.polynomials import along_row, predict
 from rcseg_core.signal.signals import INVALID, MISFIT, RANGE_OUTLIER
 from rcseg_core.signal.units import UNIT_PX
 
@@ -106,7 +106,7 @@ def gather(labels, surfaces, rim, signals, flags, n_range, models, layout, line,
                 end += 1
             if s <= 0 or layout.pitch[s] <= 0 or row & layout.skip[s]:
                 continue
-            _along_row(models, k, row, n_range, line)
+            along_row(models, k, row, n_range, line)
             down = row - layout.box[s, 0]
             pitch, left = layout.pitch[s], layout.box[s, 1]
             start, right = max(start, left), min(end, left + pitch * layout.box[s, 3])
@@ -119,19 +119,6 @@ def gather(labels, surfaces, rim, signals, flags, n_range, models, layout, line,
                 _add(start, stop, row, k, rim, signals, flags, n_range, models, layout.skip[s],
                      layout.margin[s] > 0, line, first + place, owner, sums)  # fmt: skip
                 start = stop
-
-
-@bare
-def _along_row(models, k, row, n_range, line):  # type: ignore[no-untyped-def]
-    """The range model of region k along a row: line (Cr, D + 1) of powers of x, as `predict` adds them up."""
-    y = (float(row) - models.center[k, 1]) / UNIT_PX
-    degree = models.degree[k, 0]
-    for c in range(n_range):
-        for a in range(degree + 1):
-            part = 0.0
-            for b in range(degree, -1, -1):
-                part = part * y + models.coef[k, c, a, b]
-            line[c, a] = part
 
 
 @bare
